@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from pharos import benchmark
-from pharos.benchmark.results import BASELINES, FILE
+from pharos.benchmark.results import BASELINES, RESULTS_FILE
 from pharos.benchmark.suite import CORE
 from pharos.errors import AllRunsFailed
 
@@ -83,7 +83,7 @@ def main() -> None:
             continue
         file = BASELINES / suite.name / f"{name}.safetensors"
         file.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(out / FILE, file)
+        shutil.copyfile(out / RESULTS_FILE, file)
         print(f"{name}: mean regret {outcome.results.mean():.3f}, {file.stat().st_size:,} bytes", flush=True)
 
 

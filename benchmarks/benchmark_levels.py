@@ -11,7 +11,7 @@ import math
 from dataclasses import replace
 
 from pharos.benchmark import BenchmarkTask, Ladder, Protocol, Suite, frozen, load_suite, write_suite
-from pharos.benchmark.levels import LEVELS, levels_of, overlap
+from pharos.benchmark.levels import ENVIRONMENT_NAME, levels_of, overlap
 from pharos.benchmark.suite import FOLDER
 
 PROTOCOL = Protocol(steps=150_000, evaluations=10, seeds=5)
@@ -32,7 +32,7 @@ def main() -> None:
         rungs = []
         for number in NUMBERS:
             parameters = {"world": world, "options": options, "train": number, "held_out": 0}
-            task = BenchmarkTask(f"{name}-{number}-seen", LEVELS, parameters, "recorded")
+            task = BenchmarkTask(f"{name}-{number}-seen", ENVIRONMENT_NAME, parameters, "recorded")
             core.append(frozen(task, PROTOCOL))
             parameters = {**parameters, "held_out": HELD_OUT_LEVELS}
             task = replace(task, name=f"{name}-{number}-held-out", parameters=parameters, axis=name)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.stats import kendalltau
 
 from pharos import benchmark
-from pharos.benchmark.comparison import LEAST
+from pharos.benchmark.comparison import LEAST_DIFFERENCE
 from pharos.benchmark.scores import run_scores
 from pharos.benchmark.suite import digest_of_suite
 from pharos.statistics import spearman
@@ -77,7 +77,7 @@ def order(scores: Scores) -> str:
     ranked = sorted(scores, key=lambda name: -scores[name])
     text = AGENTS[ranked[0]]
     for before, name in pairwise(ranked):
-        text += f" {'=' if scores[before] - scores[name] < LEAST else '>'} {AGENTS[name]}"
+        text += f" {'=' if scores[before] - scores[name] < LEAST_DIFFERENCE else '>'} {AGENTS[name]}"
     return text
 
 
@@ -119,7 +119,7 @@ def print_orders() -> None:
 def better(scores: Iterable[Scores], one: str, other: str) -> str:
     """On how many tasks the first agent is better, and on how many the second."""
     gaps = np.array([each[one] - each[other] for each in scores])
-    return f"{(gaps >= LEAST).sum()} or {(gaps <= -LEAST).sum()} of {len(gaps)}"
+    return f"{(gaps >= LEAST_DIFFERENCE).sum()} or {(gaps <= -LEAST_DIFFERENCE).sum()} of {len(gaps)}"
 
 
 def larger_suite() -> benchmark.Suite:

@@ -7,12 +7,12 @@ import csv
 from dataclasses import asdict, fields
 
 from pharos.benchmark import load_suite
-from pharos.benchmark.properties import FILE, TaskProperties, properties_of
+from pharos.benchmark.properties import PROPERTIES_FILE, TaskProperties, properties_of
 
 
 def main() -> None:
     suite = load_suite("v1")
-    with open(FILE, "w", encoding="utf-8", newline="") as file:
+    with open(PROPERTIES_FILE, "w", encoding="utf-8", newline="") as file:
         rows = csv.DictWriter(file, ["name", *(each.name for each in fields(TaskProperties))], lineterminator="\n")
         rows.writeheader()
         rows.writerows({"name": task.name, **asdict(properties_of(task, suite.protocol))} for task in suite.tasks)

@@ -15,7 +15,7 @@ import numpy as np
 from pharos.benchmark import faults
 from pharos.benchmark.doctor import readings
 from pharos.benchmark.examination import NAMES, examine
-from pharos.benchmark.profiles import DECIMALS, FILE
+from pharos.benchmark.profiles import DECIMALS, PROFILES_FILE
 
 FURTHER = 100  # between numbers of the healthy agents of a round
 
@@ -48,12 +48,12 @@ def agents(rounds):
 
 def examinations(agent, fault, number):
     """Examinations of one agent: all worlds with one seed, and some with another one."""
-    learn = faults.make(agent, fault, **setting(agent, fault, number))
+    learn = faults.faulty_agent(agent, fault, **setting(agent, fault, number))
     again = examine(learn, worlds=NAMES[::4], seeds=[10 * number + 1])
     return examine(learn, seeds=[10 * number]) + again
 
 
-def write(rows, file=FILE):
+def write(rows, file=PROFILES_FILE):
     """Write (agent, fault, readings) as a table."""
     names = list(dict.fromkeys(name for *_, numbers in rows for name in numbers if not name.startswith("regret_")))
     names += [f"regret_{name}" for name in NAMES]

@@ -108,9 +108,9 @@ def r_squared_at(share, pilots):
 
 def table(rows):
     """Print a line for each agent, world and observation, with both lengths."""
-    from prediction_cells import FILE, SHARES, r_squared_of_pilots
+    from prediction_cells import CELLS_FILE, SHARES, r_squared_of_pilots
 
-    stored = {(agent, words): values for agent, words, values in r_squared_of_pilots(FILE)}
+    stored = {(agent, words): values for agent, words, values in r_squared_of_pilots(CELLS_FILE)}
     heads = " | ".join(f"{steps:,} steps: share | R² of such a pilot | use" for steps in LENGTHS)
     print(f"| agent | world, observation | states | {heads} |")
     print("|" + "---|" * (3 + 3 * len(LENGTHS)))

@@ -35,10 +35,10 @@ import pandas as pd
 from pharos import study
 from pharos.agents import primary_predictors
 from pharos.prediction import Published
-from pharos.prediction.calibration import BINS, FILE, NUMBERS
+from pharos.prediction.calibration import BINS, CELLS_FILE, NUMBER_COLUMNS
 from pharos.prediction.learners import primary_regret
-from pharos.prediction.pilot import FILE as PILOT_FILE
-from pharos.prediction.pilot import SHARES as PILOTS
+from pharos.prediction.pilot import PILOT_SHARES as PILOTS
+from pharos.prediction.pilot import PILOTS_FILE
 from pharos.statistics import spearman
 from pharos.study.cross_validation import held_out
 from pharos.study.tables import CELL
@@ -207,7 +207,7 @@ def pilot_cells(file):
 
 
 def r_squared_of_pilots(file):
-    """Yield (agent, words, R2 of classes left out by SHARES): pilots, pilots with the measure, and the measure alone.
+    """Yield (agent, words, R2 of classes left out): pilots, pilots with the measure, and the measure alone.
 
     After a line or a plane through the cells of the other classes, of the mean regret of three other seeds.
     """
@@ -229,7 +229,7 @@ def pilots(file, write=False):
     if write:
         cells = pilot_cells(file)
         kept = cells[[*CELL, "predicted", "others"]].assign(**{str(share): cells[f"{share:.0%}"] for share in PILOTS})
-        kept.round(6).to_csv(PILOT_FILE, index=False, lineterminator="\n")
+        kept.round(6).to_csv(PILOTS_FILE, index=False, lineterminator="\n")
     for agent, words, values in r_squared_of_pilots(file):
         texts = [f"{value:.2f}" for value in values] + [""] * (len(SHARES) - len(values))
         print(f"| {agent.upper()} | {words} | {' | '.join(texts)} |")
@@ -296,7 +296,7 @@ def cost():
 
 def of(cells):
     mdps = cells["study"] + " " + cells["instance"] + " " + cells["chance"]
-    numbers = (cells[name].to_numpy(float) for name in NUMBERS)
+    numbers = (cells[name].to_numpy(float) for name in NUMBER_COLUMNS)
     return Published(cells["environment"].to_numpy(str), mdps.to_numpy(str), *numbers)
 
 
@@ -324,8 +324,8 @@ def statistics(known, counts):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("task", choices=("compute", "judge", "orders", "sealed", "pilots", "draw", "cost"))
-    parser.add_argument("--out", type=Path, default=FILE)
-    parser.add_argument("--cells", type=Path, default=FILE)
+    parser.add_argument("--out", type=Path, default=CELLS_FILE)
+    parser.add_argument("--cells", type=Path, default=CELLS_FILE)
     parser.add_argument("--block", action="append", choices=[*BLOCKS])
     parser.add_argument("--write", action="store_true", help="write what `pharos predict --pilot` rests on")
     parser.add_argument("--resamples", type=int, default=1000)

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from scipy import stats
 
 from pharos import study
-from pharos.prediction.calibration import FILE, NUMBERS, Published
+from pharos.prediction.calibration import CELLS_FILE, NUMBER_COLUMNS, Published
 from pharos.prediction.pairs import Pairs
 from pharos.statistics import holm, r_squared, spearman
 from pharos.study.blocks import Run
@@ -204,7 +204,7 @@ def sealed():
         table, about = study.read_predictions(file)
         parts.append(table.assign(date=about["date"]))
     predictions = pd.concat(parts, ignore_index=True)
-    today = pd.read_csv(FILE)
+    today = pd.read_csv(CELLS_FILE)
     today = today[today["study"] == "sealed-1"].rename(columns={"predicted": "sampled_regret"})
     today.loc[today["agent"] != "dqn", "sampled_regret"] = np.nan
     predictions = predictions.merge(today[[*CELL, "sampled_regret"]], on=CELL, how="left")
@@ -457,12 +457,12 @@ def facts_of_the_second_test():
     if len(dates) != len(done) or (dates["written"] < dates["date"]).any():
         raise ValueError("a run was finished before its prediction was written")
     states = pd.read_csv(SECOND / "hardness.csv")["num_states"]
-    published = pd.read_csv(FILE)
+    published = pd.read_csv(CELLS_FILE)
     held = []
     for agent, predictor in (("ppo", "clipped_regret_evaluated"), ("dqn", "sampled_regret")):
         rows = published[(published["agent"] == agent) & (published["study"] != "sealed-2")]
         mdps = np.arange(len(rows)).astype(str)
-        before = Published(rows["environment"].to_numpy(str), mdps, *(rows[name].to_numpy() for name in NUMBERS))
+        before = Published(rows["environment"].to_numpy(str), mdps, *(rows[name].to_numpy() for name in NUMBER_COLUMNS))
         both = joined(agent, "second")
         inside = (both["greedy"] - both[predictor]).abs() <= before.half_width()
         held.append(number(inside.groupby(both["environment"]).mean().mean()))

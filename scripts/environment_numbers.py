@@ -65,6 +65,9 @@ def main() -> None:
     parser.add_argument("--max-states", type=int, default=3_000_000)
     options = parser.parse_args()
     stored = json.loads(FILE.read_text()) if FILE.exists() else {}
+    for wanted in options.names:
+        if not any(name == wanted or name.startswith(f"{wanted}/") for name in named_instances()):
+            parser.error(f"{wanted}: no named instance, so no numbers; name some in `instances` of the class")
     for name in named_instances():
         old = stored.get(name, {})
         if options.names and not any(name == wanted or name.startswith(f"{wanted}/") for wanted in options.names):

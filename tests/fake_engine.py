@@ -11,7 +11,7 @@ import numpy as np
 
 MOST = 1000
 BROKEN = 0.666
-OURS = ()
+OWN_OPTIONS = ()
 """Hyperparameters that only this engine has: none."""
 made: list[int] = []
 """How many runs each batch had."""

@@ -23,7 +23,7 @@
     │   └── MeasureUnfinished           its budget ended before anything was proven
     └── MissingExtra (ImportError)      an optional dependency is needed; the message names the extra
 
-A message says whose, expected, found, and what to try, in one line.
+A message names the source, what was expected and found, and what to try, in one line.
 """
 
 import difflib
@@ -47,11 +47,11 @@ def _cut(text: str) -> str:
 
 
 class ParameterError(PharosError, ValueError):
-    """A parameter, name or option is wrong; nothing was computed."""
+    """A parameter, name or option is wrong, and nothing was computed."""
 
 
 class UnknownName(ParameterError):
-    """No such name; the message suggests the nearest one, or says what is known: all names, or `otherwise`."""
+    """No such name. The message suggests the nearest one, or says what is known: all names, or `otherwise`."""
 
     def __init__(self, kind: str, found: object, known: Iterable[str], otherwise: str = ""):
         known = sorted(map(str, known))
@@ -77,7 +77,7 @@ class StateSpaceTooLarge(StateSpaceError):
 
 
 class StateSpaceIncomplete(StateSpaceError):
-    """The build has not finished; the same command resumes it."""
+    """The build has not finished. The same command resumes it."""
 
 
 class StateSpaceCorrupted(StateSpaceError):
@@ -97,7 +97,7 @@ class StateSpaceLocked(StateSpaceError, FolderLocked):
 
 
 class DiskFull(StateSpaceError):
-    """The disk has no room left; what was committed is kept."""
+    """The disk has no room left. What was committed is kept."""
 
 
 class FileFormatError(PharosError, ValueError):
@@ -131,11 +131,11 @@ class PrecisionError(PharosError):
 
 
 class DivergenceError(PharosError, ValueError):
-    """The value asked for is infinite, or no policy has one; the message names the cycle."""
+    """The value asked for is infinite, or no policy has one. The message names the cycle."""
 
 
 class UndefinedMeasure(PharosError):
-    """The measure does not exist for this MDP; the message says what would define it."""
+    """The measure does not exist for this MDP. The message says what would define it."""
 
 
 class MeasureUnfinished(UndefinedMeasure):
@@ -143,7 +143,7 @@ class MeasureUnfinished(UndefinedMeasure):
 
 
 class MissingExtra(PharosError, ImportError):
-    """An optional dependency is missing; the message names the extra that brings it."""
+    """An optional dependency is missing. The message names the extra that brings it."""
 
     def __init__(self, purpose: str, package: str, extra: str):
         hint = f"pip install 'pharos-rl[{extra}]'"

@@ -27,8 +27,8 @@ def drn(mdp: TabularMDP, path: str | os.PathLike) -> Path:
     more, first state.
 
     Raises:
-        ParameterError: sticky actions (see `gym_p`); or the name does not end in .drn.
-    Cost: a line for each transition; for small MDPs.
+        ParameterError: sticky actions (see `gym_p`), or the name does not end in .drn.
+    Cost: a line for each transition, so for small MDPs.
     """
     path = Path(path)
     if path.suffix != ".drn":
@@ -86,12 +86,12 @@ def gym_p(mdp: TabularMDP) -> dict[int, dict[int, list[Outcome]]]:
     """Return P[s][a] = [(probability, next state, reward, terminated), ...], as Gymnasium's toy texts have it.
 
     A state has the actions that are available there. The implicit end becomes one more state S, if there is one.
-    Random actions are written out as outcomes. Each outcome has its own reward if the MDP is of an environment and
-    has its rewards; otherwise the expected reward of what is executed.
+    Random actions are written out as outcomes. Each outcome has its own reward if the MDP is of an environment and has
+    its rewards, otherwise the expected reward of what is executed.
 
     Raises:
         ParameterError: under sticky actions the state is a pair, which this table has no room for.
-    Cost: Python objects for each transition; for small MDPs.
+    Cost: Python objects for each transition, so for small MDPs.
     """
     if mdp.is_sticky:
         raise ParameterError(
@@ -133,7 +133,7 @@ def bridge(mdp: TabularMDP, path: str | os.PathLike) -> Path:
 
     Raises:
         ParameterError: the MDP has chance, several start states, or actions that are not available in some states,
-            which the form cannot say; or the name does not end in .npz.
+            which the form cannot say, or the name does not end in .npz.
     """
     path = Path(path)
     if path.suffix != ".npz":
@@ -161,7 +161,7 @@ def bridge(mdp: TabularMDP, path: str | os.PathLike) -> Path:
 
 
 def _screens(mdp: TabularMDP, order: np.ndarray) -> dict[str, np.ndarray]:
-    """Distinct images of a folder and the image of each state; nothing if there are none."""
+    """Distinct images of a folder and the image of each state, or nothing if there are none."""
     if mdp.folder is None or not mdp_files.is_folder(mdp.folder):
         return {}
     manifest = mdp_files.read_mdp_manifest(mdp.folder)

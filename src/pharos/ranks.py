@@ -1,7 +1,7 @@
 """Several processes that compute one thing together: ranks, and their exchange of arrays.
 
 Rank 0 is the one that the user sees: it alone reads and writes files, reports and raises the errors of all. The others
-run a function that answers it. Messages go by MPI (extra `mpi`: mpi4py), among ranks that `mpiexec` has started; tests
+run a function that answers it. Messages go by MPI (extra `mpi`: mpi4py), among ranks that `mpiexec` has started. Tests
 run ranks as threads.
 
 Halos are borders of ranges of rows, one range for each rank: the rows of other ranks that a rank reads. Their values
@@ -34,7 +34,7 @@ _ROWS_AT_ONCE = 1 << 20  # most rows that rank 0 sends to each rank in one excha
 
 
 class RankFailed(PharosError):
-    """Another rank failed, or died; the message says which one and why."""
+    """Another rank failed, or died. The message says which one and why."""
 
 
 class Rank(ABC):
@@ -54,7 +54,7 @@ class Rank(ABC):
     def exchange(self, parts: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Send parts[q] to each rank q, and return what each of them has sent here, in their order.
 
-        All ranks call it together; all parts have one dtype, and one shape behind the first axis.
+        All ranks call it together. All parts have one dtype, and one shape behind the first axis.
 
         Raises:
             RankFailed: a rank failed or died, in place of answering.
@@ -72,7 +72,7 @@ class Rank(ABC):
 
     @abstractmethod
     def receive(self, source: int, into: np.ndarray) -> None:
-        """Begin to receive an array into `into`, C-contiguous; its content is undefined until `finish`."""
+        """Begin to receive an array into `into`, C-contiguous. Its content is undefined until `finish`."""
 
     def progress(self) -> None:  # noqa: B027
         """Let pending messages move on: to be called now and then while this process computes."""
@@ -92,7 +92,7 @@ class Rank(ABC):
         """Abort: every exchange and message of the other ranks, pending or later, raises."""
 
     def scatter(self, parts: Sequence[np.ndarray] | None, like: np.ndarray) -> np.ndarray:
-        """Send parts[q] from rank 0 to each rank q, and return it there; `like` is an array of that type."""
+        """Send parts[q] from rank 0 to each rank q, and return it there. `like` is an array of that type."""
         return self.exchange(parts or [like[:0]] * self.size)[0]
 
     def scatter_rows(self, array: np.ndarray | None, cuts: np.ndarray, into: np.ndarray) -> None:
@@ -110,7 +110,7 @@ class Rank(ABC):
         return self.scatter(None if array is None else [array] * self.size, like)
 
     def gather(self, array: np.ndarray) -> list[np.ndarray]:
-        """The arrays of all ranks, in their order, at rank 0; elsewhere empty arrays."""
+        """The arrays of all ranks, in their order, at rank 0, elsewhere empty arrays."""
         return self.exchange([array if rank == 0 else array[:0] for rank in range(self.size)])
 
     def allgather(self, array: np.ndarray) -> list[np.ndarray]:
@@ -144,7 +144,7 @@ class Alone(Rank):
 
 
 def text_of(error: BaseException) -> str:
-    """Text of an error, to be sent to other ranks; see `error_of`."""
+    """Text of an error, to be sent to other ranks, see `error_of`."""
     return f"{type(error).__name__}\n{error}"
 
 
@@ -176,7 +176,7 @@ class Halo:
         rows: (H,) int64, ascending.
         of_rank: for each rank, the slice of `rows` that lies in its range.
         wanted: for each rank, the rows of this one that it reads, int64, counted from the first row of this one.
-        low: this rank's rows before that are its low ones, counted from its first; all where nobody reads high ones.
+        low: this rank's rows before that are its low ones, counted from its first. All if nobody reads high ones.
     """
 
     def __init__(self, rank: Rank, rows: np.ndarray, cuts: np.ndarray):
@@ -206,7 +206,7 @@ class Halo:
     # While messages travel: receive, then send all or high and low ones, then finish --------------------------------
 
     def receive(self, like: np.ndarray, in_two: bool = False) -> None:
-        """Begin to receive values of the halo, rows like the rows of `like`; in one message from each rank, or in
+        """Begin to receive values of the halo, rows like the rows of `like`, in one message from each rank, or in
         two."""
         received = self._received
         if received is None or received.dtype != like.dtype or received.shape[1:] != like.shape[1:]:
@@ -270,7 +270,8 @@ def run_spmd(processes: int | str, program: Callable[[Rank], T]) -> T:
     """The result of `program(rank)` at this rank, while the other ranks run it, too.
 
     Args:
-        processes: 1 for this process alone; or "mpi", those that `mpiexec` has started, all of which make this call.
+        processes: 1 for this process alone, or "mpi" for the processes that `mpiexec` has started, all of which make
+            this call.
     Raises:
         Whatever the program raises on any of them.
     """
@@ -313,7 +314,7 @@ def start_under_mpiexec(size: int) -> NoReturn:
 
 
 def _end_of(command: Sequence[str]) -> tuple[int, str]:
-    """(exit code, standard output) of a launcher, which ends with this process; interrupts are left to its processes.
+    """(exit code, standard output) of a launcher, which ends with this process. Interrupts are left to its processes.
 
     MPICH's says on standard output that a process was killed, and in its exit code by which signal.
     """
@@ -337,7 +338,7 @@ def _end_with_parent() -> None:
 
 
 def launched() -> tuple[int, int]:
-    """(rank, size) of this process among the processes that a launcher has started; (0, 1) if none has.
+    """(rank, size) of this process among the processes that a launcher has started, (0, 1) if none has.
 
     MPI is not loaded.
     """
@@ -400,9 +401,9 @@ class _Mpi(Rank):
         return self._numbers[:, : len(numbers)]
 
     def _counts(self, rows: np.ndarray, numbers: Sequence[float] = ()) -> np.ndarray:
-        """Number of rows that each rank sends here; every collective call begins with it, so that all learn who failed.
+        """Number of rows that each rank sends here. Every collective call begins with it, so that all learn who failed.
 
-        numbers: to be sent to all ranks; theirs are in `_numbers` (P, NUMBERS) then.
+        numbers: to be sent to all ranks. Theirs are in `_numbers` (P, NUMBERS) then.
         """
         received = self._headers(rows, numbers)
         failed = np.flatnonzero(received == _FAILED)
@@ -412,7 +413,7 @@ class _Mpi(Rank):
         return received
 
     def _headers(self, rows: np.ndarray, numbers: Sequence[float] = ()) -> np.ndarray:
-        """Exchange headers: numbers of rows, or _FAILED, and `numbers`; returns the first entry of each rank's."""
+        """Exchange headers: numbers of rows, or _FAILED, and `numbers`. Returns the first entry of each rank's."""
         sent, received = np.zeros((2, self.size, 1 + MOST_NUMBERS), np.int64)
         sent[:, 0] = rows
         sent[:, 1 : 1 + len(numbers)] = np.array(numbers, np.float64).view(np.int64)

@@ -1,6 +1,6 @@
-"""Regret: what is lost by not having played the optimal policy from the first episode on; and its one normalisation.
+"""Regret: what is lost by not having played the optimal policy from the first episode on, and its one normalisation.
 
-Episode k starts in s0 and is played with policy pi_k; V* and V^pi are values from the start, in the same setting
+Episode k starts in s0 and is played with policy pi_k. V* and V^pi are values from the start, in the same setting
 (discount, horizon, chance) as the returns.
 
     expected regret     V*(s0) - V^{pi_k}(s0)      of a policy, by exact evaluation; never negative
@@ -8,10 +8,10 @@ Episode k starts in s0 and is played with policy pi_k; V* and V^pi are values fr
     cumulative          summed over the episodes of a run
     normalised          divided by the same of a reference policy: 0 is optimal, 1 as bad as the reference
 
-Both agree in expectation if pi_k is what played episode k; a DQN also explores, so its realised regret is larger.
+Both agree in expectation if pi_k is what played episode k. A DQN also explores, so its realised regret is larger.
 
-Source: expected regret over episodes: Azar, Osband and Munos (2017), section 2; expected and realised ("pseudo-regret"
-and "regret"): Bubeck and Cesa-Bianchi (2012), section 1; 1 minus the normalised regret is the normalised score of Mnih
+Source: expected regret over episodes: Azar, Osband and Munos (2017), section 2. Expected and realised ("pseudo-regret"
+and "regret"): Bubeck and Cesa-Bianchi (2012), section 1. 1 minus the normalised regret is the normalised score of Mnih
 et al. (2015), with the exact optimum in place of a human.
 """
 
@@ -39,7 +39,7 @@ def regret_scale(optimal: ArrayLike, reference: ArrayLike, error_bound: float = 
     """Return V* - V of a reference policy: divided by it, the regret of the optimum is 0, of the reference policy 1.
 
     Args:
-        optimal, reference: numbers or arrays; values from the start, in return.
+        optimal, reference: numbers or arrays, values from the start, in return.
         error_bound: of each of the two.
     Returns:
         A float or an array, in return. NaN if it is not above max(1e-12, 2 `error_bound`): then the reference
@@ -64,7 +64,7 @@ class ReferenceValues:
     """Values from the start of the policies that regret is measured against.
 
     Attributes:
-        optimal, uniform, worst: of the optimal, the uniformly random and the worst policy; `worst` may be NaN if
+        optimal, uniform, worst: of the optimal, the uniformly random and the worst policy. `worst` may be NaN if
             unknown.
         error_bound: each is within this of the true value.
     """
@@ -76,11 +76,11 @@ class ReferenceValues:
 
     @staticmethod
     def of(task: "HasReference") -> "ReferenceValues":
-        """Reference values of a task; its space is built and solved if it is not yet."""
+        """Reference values of a task. Its space is built and solved if it is not yet."""
         return task.reference
 
     def spread(self, reference: str = "uniform") -> float:
-        """V* - V of the reference policy, "uniform" or "worst"; NaN if it is too small to divide by.
+        """V* - V of the reference policy, "uniform" or "worst", NaN if it is too small to divide by.
 
         Raises:
             ParameterError: another reference.
@@ -106,9 +106,9 @@ def regret(
     Args:
         value: a number or an array: values for expected, returns for realised regret.
         values: of the task.
-        normalized_by: None; or "uniform" or "worst", the policy whose regret is 1.
+        normalized_by: None, or "uniform" or "worst", the policy whose regret is 1.
     Returns:
-        A float or an array; in units of return, or without if normalised. NaN if it cannot be normalised, because
+        A float or an array, in units of return, or without if normalised. NaN if it cannot be normalised, because
         the reference policy is itself optimal (within the errors of the values). Values with errors may give as much
         less than 0.
     Raises:

@@ -9,7 +9,7 @@ Tests       `welch_p_value`, `permutation_p_value`, and `holm` for several of th
 Ranks       `ranks` and `spearman`, in which rounding makes no order.
 
 Source: Agarwal et al. (2021), Deep reinforcement learning at the edge of the statistical precipice, for strata and
-aggregates; others stand at each function.
+aggregates. Others stand at each function.
 """
 
 import math
@@ -41,7 +41,7 @@ def interquartile_mean(*strata: np.ndarray, axis: int = -1) -> np.ndarray:
 
     Args:
         strata: arrays whose `axis` counts runs, alike in all other axes.
-    Cost: O(n); no sorting.
+    Cost: O(n), without sorting.
     Source: Agarwal et al. (2021), section 4.3. With five runs a stratum, percentile intervals of it are too narrow
         (about 85 % coverage for a nominal 95 %).
 
@@ -70,7 +70,7 @@ def probability_of_improvement(ours: Strata, theirs: Strata, axis: int = -1) -> 
 
     Args:
         ours, theirs: for each stratum the scores of its runs along `axis`, the same strata in the same order.
-    Source: Agarwal et al. (2021), section 4.3; Mann and Whitney (1947).
+    Source: Agarwal et al. (2021), section 4.3, and Mann and Whitney (1947).
 
     >>> float(probability_of_improvement([np.array([1.0, 2.0])], [np.array([1.0, 0.0])]))
     0.875
@@ -110,9 +110,9 @@ def standard_error(strata: Strata, weights: Sequence[float]) -> tuple[float, flo
     Args:
         strata: (n_t,) values of each stratum. weights: w_t of each mean.
     Returns:
-        NaN and NaN if a stratum has one run; 0 and infinity if the runs of every one agree.
+        NaN and NaN if a stratum has one run. 0 and infinity if the runs of every one agree.
     Source: Welch (1947), The generalization of Student's problem when several different population variances are
-        involved; Satterthwaite (1946), An approximate distribution of estimates of variance components.
+        involved, and Satterthwaite (1946), An approximate distribution of estimates of variance components.
 
     >>> standard_error([np.array([0.0, 2.0]), np.array([1.0, 1.0])], [0.5, 0.5])
     (0.5, 1.0)
@@ -135,7 +135,7 @@ def student_interval(
     """Return (value, low, high), the ends value -/+ t error of a 95 % interval, clipped to `bounds`.
 
     Args:
-        error, degrees: as from `standard_error`; the ends are NaN if the error is.
+        error, degrees: as from `standard_error`. The ends are NaN if the error is.
 
     >>> [round(end, 3) for end in student_interval(0.5, 0.1, math.inf)]
     [0.5, 0.304, 0.696]
@@ -150,7 +150,7 @@ def welch_p_value(difference: float, error: float, degrees: float) -> float:
     """Return the two-sided p-value of a difference of means, which `student_interval` excludes 0 by if p < 0.05.
 
     Args:
-        error, degrees: as from `standard_error`; without error any difference beyond rounding has p = 0.
+        error, degrees: as from `standard_error`. Without error any difference beyond rounding has p = 0.
 
     >>> round(welch_p_value(0.196, 0.1, math.inf), 3)
     0.05
@@ -161,7 +161,7 @@ def welch_p_value(difference: float, error: float, degrees: float) -> float:
 
 
 def mean_interval(strata: Strata, bounds: tuple[float, float] = UNBOUNDED) -> tuple[float, float, float]:
-    """Return (`mean_of_means`, low, high), with Student's 95 % interval; NaN without strata.
+    """Return (`mean_of_means`, low, high), with Student's 95 % interval, NaN without strata.
 
     >>> mean_interval([np.array([0.25, 0.25]), np.array([0.75, 0.75])])
     (0.5, 0.5, 0.5)
@@ -173,7 +173,7 @@ def mean_interval(strata: Strata, bounds: tuple[float, float] = UNBOUNDED) -> tu
 
 
 def interquartile_interval(strata: Strata, bounds: tuple[float, float] = UNBOUNDED) -> tuple[float, float, float]:
-    """Return (`interquartile_mean`, low, high), with Student's 95 % interval; NaN without strata.
+    """Return (`interquartile_mean`, low, high), with Student's 95 % interval, NaN without strata.
 
     The standard error is computed for twice the mean of runs winsorised at the pooled quartiles, over runs in strata.
 
@@ -195,13 +195,13 @@ def fieller_interval(levels: np.ndarray, strata: Strata, target: float) -> tuple
     It holds the levels at which Student's interval of the interpolated mean contains the target, with limits made
     increasing, as the mean is: the upper limit at a level is the smallest from there on, the lower one the largest up
     to there. So it runs from the last level whose upper limit is below the target to the first one whose lower limit is
-    above it; if the first lies behind the second, between them. Both ends are roots, found to rounding between
+    above it. If the first lies behind the second, between them. Both ends are roots, found to rounding between
     neighbours of 256 points of a segment.
 
     Args:
         levels: (L,) increasing. strata: for each level the values of its runs.
     Returns:
-        NaN and NaN if a level has one run; -/+ infinity for an end beyond the first or last level.
+        NaN and NaN if a level has one run. -/+ infinity for an end beyond the first or last level.
     Source: Fieller (1954), Some problems in interval estimation.
 
     >>> fieller_interval(np.array([1.0, 3.0]), [np.array([0.0, 0.0]), np.array([1.0, 1.0])], target=0.5)
@@ -218,7 +218,7 @@ def fieller_interval(levels: np.ndarray, strata: Strata, target: float) -> tuple
     last = len(levels) - 1
 
     def excess(position: float | np.ndarray, side: int) -> np.ndarray:
-        """Upper (side 1) or lower (side -1) limit of the mean less the target; positions count levels from 0."""
+        """Upper (side 1) or lower (side -1) limit of the mean less the target. Positions count levels from 0."""
         left = np.minimum(np.asarray(position).astype(int), max(last - 1, 0))
         right = np.minimum(left + 1, last)
         share = position - left
@@ -265,17 +265,18 @@ def bootstrap_interval(
     Each stratum is resampled with replacement by itself.
 
     Args:
-        strata: arrays (..., N) of N runs each; N may differ. The other axes are drawn together, such as all points of
+        strata: arrays (..., N) of N runs each. N may differ. The other axes are drawn together, such as all points of
             a curve, and are alike in all strata.
         statistic: `statistic(*strata, axis=-1)`, vectorised over all other axes.
         confidence, resamples, seed: of the bootstrap.
     Returns:
-        lower, upper: of the shape of the statistic; NaN if it is NaN for a resample, or if a stratum has one run: that
+        lower, upper: of the shape of the statistic. NaN if it is NaN for a resample, or if a stratum has one run: that
             does not say how runs vary.
     Raises:
         ParameterError: there is no stratum, or one is empty or has an entry that is not finite.
     Cost: `resamples` times the statistic, in batches.
-    Source: Efron and Tibshirani (1993), An introduction to the bootstrap, section 13.3; draws as scipy.stats.bootstrap.
+    Source: Efron and Tibshirani (1993), An introduction to the bootstrap, section 13.3. Draws are the same as in
+        scipy.stats.bootstrap.
 
     >>> low, high = bootstrap_interval([np.array([0.0, 1.0]), np.array([0.5, 0.5])], mean_of_means)
     >>> float(low), float(high)
@@ -302,7 +303,7 @@ def bootstrap_interval(
 
 
 def _quantile(ascending: np.ndarray, share: float) -> np.ndarray:
-    """Linear interpolation between order statistics (..., R), rounded as scipy.stats.quantile; NaN if one is."""
+    """Linear interpolation between order statistics (..., R), rounded as scipy.stats.quantile, NaN if one is."""
     number = ascending.shape[-1]
     position = share * number + (1 - share)  # counted from 1
     above, fraction = min(int(position), number - 1), position % 1
@@ -311,7 +312,7 @@ def _quantile(ascending: np.ndarray, share: float) -> np.ndarray:
 
 
 def percentiles(values: np.ndarray, *shares: float) -> np.ndarray:
-    """Return percentiles, shares in [0, 100], of the values that are finite; NaN without any.
+    """Return percentiles, shares in [0, 100], of the values that are finite, NaN without any.
 
     >>> percentiles(np.array([1.0, np.nan, 3.0]), 50).tolist()
     [2.0]
@@ -324,7 +325,7 @@ def percentiles(values: np.ndarray, *shares: float) -> np.ndarray:
 
 
 def permutation_p_value(value: float, permuted: np.ndarray) -> float:
-    """Return the share of permutations whose statistic is as large, the observed order among them; NaN without any.
+    """Return the share of permutations whose statistic is as large, the observed order among them, NaN without any.
 
         p = (1 + number of permuted >= value) / (1 + R)
 
@@ -340,7 +341,7 @@ def permutation_p_value(value: float, permuted: np.ndarray) -> float:
 
 
 def holm(p_values: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Return (N,) p-values after the step-down correction for their number; NaN stays NaN, and does not count.
+    """Return (N,) p-values after the step-down correction for their number. NaN stays NaN, and does not count.
 
         the k-th smallest of n times n - k + 1, not decreasing, at most 1
 
@@ -361,7 +362,7 @@ def holm(p_values: Sequence[float] | np.ndarray) -> np.ndarray:
 
 
 def class_weights(classes: np.ndarray) -> np.ndarray:
-    """Return (N,) weights that sum to 1, the same sum for each class; `classes` (N,) are integers from 0.
+    """Return (N,) weights that sum to 1, the same sum for each class. `classes` (N,) are integers from 0.
 
     >>> class_weights(np.array([0, 0, 1])).tolist()
     [0.25, 0.25, 0.5]
@@ -371,11 +372,11 @@ def class_weights(classes: np.ndarray) -> np.ndarray:
 
 
 def r_squared(values: np.ndarray, errors: np.ndarray, classes: np.ndarray | None = None) -> float:
-    """Return 1 - sum of squared errors / sum of squares about the mean; NaN if all values are equal.
+    """Return 1 - sum of squared errors / sum of squares about the mean, NaN if all values are equal.
 
     Args:
         values, errors: (N,) outcomes, and what a prediction of each lacks.
-        classes: (N,) integers from 0, to weigh classes alike, each by `class_weights`; None: rows weigh alike.
+        classes: (N,) integers from 0, to weigh classes alike, each by `class_weights`. None: rows weigh alike.
 
     >>> r_squared(np.array([0.0, 2.0]), np.array([1.0, 0.0]))
     0.5
@@ -389,7 +390,7 @@ def r_squared(values: np.ndarray, errors: np.ndarray, classes: np.ndarray | None
 
 
 def ranks(values: np.ndarray) -> np.ndarray:
-    """Return (..., N) ranks from 1 along the last axis; ties share their mean rank.
+    """Return (..., N) ranks from 1 along the last axis. Ties share their mean rank.
 
     What lies within 1e-9 of the spread of its neighbour is tied, so equal predictors whose predictions differ in the
     last bits are ranked alike on every machine.
@@ -410,7 +411,7 @@ def ranks(values: np.ndarray) -> np.ndarray:
 
 
 def spearman(x: np.ndarray, y: np.ndarray) -> float:
-    """Return the rank correlation of x (N,) and y by `ranks`; NaN with fewer than three rows, or if one is constant.
+    """Return the rank correlation of x (N,) and y by `ranks`, NaN with fewer than three rows, or if one is constant.
 
     >>> round(spearman(np.array([1.0, 2.0, 9.0]), np.array([0.3, 0.2, 0.1])), 9)
     -1.0

@@ -26,9 +26,10 @@ import numpy as np
 import yaml
 
 from command_line import run
+from patience import PATIENCE
 from pharos.errors import PharosError
 
-SECONDS = 5
+SECONDS = 30  # of the processor
 MORE_MEMORY = 6 << 30  # address space that a case may take beyond what the process has
 
 NUMBERS = (-1, 2**31, 2**63, 10**400, 1e300, -0.5, float("nan"), float("inf"), True)
@@ -268,7 +269,7 @@ def outcome(read: Callable[[], Any], expected: Collection[str]) -> tuple[str, st
             is_line = text.strip() and all("\n" not in line and len(line) < 3000 for line in lines)
             return ("refused" if is_line else "failed"), text
         except Endless:
-            return "failed", f"takes more than {SECONDS} s"
+            return "failed", f"takes more than {SECONDS} s of the processor, or never ends"
         except IsADirectoryError as error:  # of a file that was to be written, which commands say in a line
             return ("refused" if error.filename else "failed"), str(error)
         except Exception as error:
@@ -281,23 +282,26 @@ def outcome(read: Callable[[], Any], expected: Collection[str]) -> tuple[str, st
 
 @contextlib.contextmanager
 def limited() -> Iterator[None]:
-    """A limit of time and of memory."""
+    """A limit of processor time, which other work on the machine does not use up, of patience, and of memory."""
 
     def stop(*_: Any) -> None:
         raise Endless
 
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     pages = int(Path("/proc/self/statm").read_text().split()[0]) if Path("/proc/self/statm").exists() else None
-    before = signal.signal(signal.SIGALRM, stop)
+    before = {each: signal.signal(each, stop) for each in (signal.SIGPROF, signal.SIGALRM)}
     if pages is not None:
         resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MORE_MEMORY, hard))
-    signal.setitimer(signal.ITIMER_REAL, SECONDS)
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
+    signal.setitimer(signal.ITIMER_REAL, PATIENCE)
     try:
         yield
     finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
         signal.setitimer(signal.ITIMER_REAL, 0)
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
-        signal.signal(signal.SIGALRM, before)
+        for each, handler in before.items():
+            signal.signal(each, handler)
 
 
 def command(*words: Any) -> dict[str, Any]:

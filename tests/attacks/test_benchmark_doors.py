@@ -8,6 +8,7 @@ import concurrent.futures
 import copy
 import io
 import itertools
+import json
 import multiprocessing
 import pickle
 import shutil
@@ -23,13 +24,17 @@ import pytest
 import yaml
 
 import pharos
-from attacks.damage import Attack, Refused, Tally, command, outcome
+from attacks.damage import NUMBERS, OTHERS, Attack, Refused, Tally, command, outcome
 from pharos import benchmark, importers, study
-from pharos.benchmark import BenchmarkTask, BudgetSpent, Protocol, Suite, load_suite, write_suite
-from pharos.benchmark.suite import digest_of_suite, frozen
+from pharos.benchmark import AgentResults, BenchmarkTask, BudgetSpent, Protocol, Suite, load_suite, write_suite
+from pharos.benchmark.execution import selected
+from pharos.benchmark.levels import levels_of
+from pharos.benchmark.scores import score
+from pharos.benchmark.suite import Ladder, digest_of_suite, digest_of_task, frozen
 from pharos.errors import ParameterError, PharosError
 from pharos.interaction import GymEnv
 from pharos.mdp import TabularMDP
+from pharos.training import Task
 from pharos.training.budget import generated_curve
 
 pytestmark = pytest.mark.long
@@ -70,6 +75,82 @@ def test_damaged_suites(suite, tmp_path, count):
     tally = Attack(tmp_path / "suites", ("mini.yaml",), read).run(tmp_path / "copies")
     count(f"{tally.total} damaged suites: {tally}")
     assert tally.total >= 25 and tally.counts["refused"] >= 15
+
+
+def test_suites_with_the_right_digest_that_say_nonsense(tmp_path, monkeypatch, count):
+    """What is read of a quick look, stored values, levels and pairs can be used; all else is refused."""
+    stored = {"states": 10, "worst": 0.0, "lowest": 0.0, "highest": 3.0, "error_bound": 1e-9}
+    large = BenchmarkTask("large", "frozen_lake", value_optimal=3.0, value_uniform=1.0, stored=stored)
+    sea = replace(SEA, value_optimal=1.0, value_uniform=0.0)
+    rungs = tuple(replace(sea, name=f"rung-{k}", axis="size", level=float(k)) for k in range(2))
+    pairs = tuple(replace(sea, name=f"pair-{k}", axis="eyes", level=float(k)) for k in range(2))
+    ladders = Ladder("size", "bits", "of states", rungs), Ladder("eyes", "loss", "of eyes", pairs, "pairs")
+    write_suite(
+        Suite("mini", PROTOCOL, (large,), ladders, "", {}, {"tasks": ["size"], "seeds": 2}), tmp_path / "s.yaml"
+    )
+    entry = yaml.safe_load((tmp_path / "s.yaml").read_text())
+    monkeypatch.setattr("pharos.benchmark.suite.digest_of_suite", lambda suite: suite.digest)  # as a forger has it
+    values = [value for value in (*NUMBERS, *OTHERS)]
+    changes = {
+        "quick": values,
+        "quick tasks": [*values, ["nobody"], "core"],
+        "quick seeds": values,
+        "quick weights": [1],
+    }
+    changes |= {f"core 0 stored {name}": values for name in ("states", "worst", "lowest", "highest", "error_bound")}
+    changes |= {"core 0 stored": values, "core 0 value_optimal": values, "core 0 value_uniform": values}
+    for k in range(2):
+        changes |= {f"ladders {k} {name}": values for name in ("measure", "tasks", "axis", "tasks 0 level")}
+        changes |= {f"ladders {k} weights": [{"pair-0": 1e300}, [1, 2]], f"ladders {k} tasks 1 level": values}
+        changes |= {
+            f"ladders {k} pairs": [[["pair-0", "pair-0"]]],
+            f"ladders {k} tasks 1": [entry["ladders"][k]["tasks"][0]],
+        }
+    tally = Tally()
+
+    def read():
+        suite = load_suite(tmp_path / "s.yaml")
+        assert 1 <= suite.quick_seeds <= 1000 and all(selected(suite, [name]) for name in suite.quick_tasks)
+        for ladder in suite.ladders:
+            names = [task.name for task in ladder.tasks]
+            assert abs(sum(ladder.weights(names).values()) - (0 if ladder.pairs else bool(names))) < 1e-9
+            regret = AgentResults("a", suite.name, suite.digest, (0, 1), {name: np.full((2, 3), 0.5) for name in names})
+            json.dumps(score(regret, suite).axes[ladder.axis].to_dict())
+        for task in suite.core:
+            own = task.stored_values
+            assert own is None or 0 < own.reference.spread() < 1e299
+        return True
+
+    assert read()
+    for place, options in changes.items():
+        for value in options:
+            forged_entry = copy.deepcopy(entry)
+            *way, last = (int(word) if word.isdigit() else word for word in place.split())
+            owner = forged_entry
+            for word in way:
+                owner = owner[word]
+            owner[last] = value
+            (tmp_path / "s.yaml").write_text(yaml.safe_dump(forged_entry))
+            tally.note(f"{place} {str(value)[:20]}", *outcome(read, ("True",)))
+    count(f"{tally.total} suites with the right digest: {tally}")
+    tally.check()
+    assert tally.total >= 250 and tally.counts["refused"] >= 150
+
+
+def test_levels_in_the_cache(tmp_path, monkeypatch, count):
+    """Levels that are damaged are written anew, or refused."""
+
+    def read(folder):
+        monkeypatch.setenv("PHAROS_CACHE_DIR", str(folder))
+        return digest_of_task(Task(levels_of("frozen_lake", {"size": 4}, train=1, held_out=1), observation="recorded"))
+
+    read(tmp_path / "cache")
+    files = [path.relative_to(tmp_path / "cache") for path in (tmp_path / "cache" / "levels").rglob("*")]
+    names = tuple(sorted(str(name) for name in files if (tmp_path / "cache" / name).is_file() and name.name != "lock"))
+    (tmp_path / "copies").mkdir()
+    tally = Attack(tmp_path / "cache", names, read, fewer=2).run(tmp_path / "copies")
+    count(f"{tally.total} damaged files of levels in the cache: {tally}")
+    assert tally.total >= 60 and tally.counts["unchanged"] >= 30
 
 
 NAMES = ("../x", "../../x", "/tmp/x", ".", "..", "", "a/b", "a\\b", "a\nb", "a\0b", "a b", ".hidden", "-rf", "x" * 300)

@@ -84,5 +84,7 @@ def test_results_that_are_nowhere(tmp_path):
     run = tmp_path / "interrupted" / "runs" / "sea" / "seed-0"
     run.mkdir(parents=True)
     (run / "curve.csv").touch()
-    assert "1 so far: the same command goes on" in refusal(ParameterError, AgentResults.read, tmp_path / "interrupted")
+    assert "1 runs have finished, some are missing: run the same command again" in refusal(
+        ParameterError, AgentResults.read, tmp_path / "interrupted"
+    )
     assert baselines("no such suite") == ()

@@ -8,7 +8,7 @@ import pytest
 from pharos.benchmark.doctor import (
     EQUATIONS,
     GAMMAS,
-    RIGHT,
+    RIGHT_EQUATION,
     contrast,
     cut_shares,
     on_policy,
@@ -24,7 +24,7 @@ from pharos.benchmark.examination import Examination, WorldArrays
 
 GAMMA = 0.9
 STATES, ACTIONS = 9, 3
-BY_VALUES = [name for name in EQUATIONS if name not in (RIGHT, "to_next_episode")]
+BY_VALUES = [name for name in EQUATIONS if name not in (RIGHT_EQUATION, "to_next_episode")]
 
 
 def world(seed):
@@ -95,7 +95,7 @@ def solve(world, name, gamma, cuts, policy=None, scale=1.0, at_terminal=0.7):
 def test_optimal_values_are_those_of_plain_loops():
     for seed in range(3):
         here = world(seed)
-        expected = solve(here, RIGHT, GAMMA, np.zeros((STATES, ACTIONS)), at_terminal=0.0)
+        expected = solve(here, RIGHT_EQUATION, GAMMA, np.zeros((STATES, ACTIONS)), at_terminal=0.0)
         assert np.abs(optimal(here, GAMMA) - expected).max() < 1e-6
 
 
@@ -131,7 +131,7 @@ def test_values_of_a_policy_are_told_from_those_that_run_on_into_the_next_episod
     here, rng = world(2), np.random.default_rng(0)
     policy = rng.dirichlet(np.ones(ACTIONS), STATES)
     none = np.zeros((STATES, ACTIONS))
-    for name, is_wrong in ((RIGHT, False), ("to_next_episode", True)):
+    for name, is_wrong in ((RIGHT_EQUATION, False), ("to_next_episode", True)):
         q = solve(here, name, GAMMA, none, policy=policy)
         each = examination(here, v=(policy * q).sum(axis=1), policy=policy, cuts=0)
         assert (contrast(each, "to_next_episode", GAMMA, GAMMA) < 0) == is_wrong
@@ -142,16 +142,16 @@ def test_values_of_what_was_played_obey_the_equation_of_a_learner_on_policy_alon
     here, none = world(1), np.zeros((STATES, ACTIONS))
     steps = examination(here, q=none)
     frequency = steps.visits / np.maximum(steps.visits.sum(axis=1, keepdims=True), 1)
-    q = solve(here, RIGHT, GAMMA, none, policy=frequency, at_terminal=0.0)
+    q = solve(here, RIGHT_EQUATION, GAMMA, none, policy=frequency, at_terminal=0.0)
     each = examination(here, q=q)
     place = GAMMAS.index(GAMMA)
-    assert residuals(on_policy(each))[RIGHT][place] < 1e-6 < 0.05 < residuals(each)[RIGHT].min()
+    assert residuals(on_policy(each))[RIGHT_EQUATION][place] < 1e-6 < 0.05 < residuals(each)[RIGHT_EQUATION].min()
     numbers, played = readings([each]), readings([on_policy(each)])
     assert numbers["on_policy"] == played["consistency"] == pytest.approx(np.log10(0.02), abs=1e-3)
     assert played["gamma"] == pytest.approx(-np.log10(1 - GAMMA)) and played["truth"] > 0.999
     assert abs(played["slope"]) < 1e-3 and abs(played["size"]) < 1e-3
     greedy = examination(here, q=optimal(here, GAMMA))
-    assert residuals(greedy)[RIGHT][place] < 1e-6 < 0.05 < residuals(on_policy(greedy))[RIGHT].min()
+    assert residuals(greedy)[RIGHT_EQUATION][place] < 1e-6 < 0.05 < residuals(on_policy(greedy))[RIGHT_EQUATION].min()
 
 
 def test_values_of_states_that_the_agent_has_left_are_no_sign_of_an_end_at_the_time_limit():
@@ -160,7 +160,7 @@ def test_values_of_states_that_the_agent_has_left_are_no_sign_of_an_end_at_the_t
     v, has_left = (policy * optimal(here, GAMMA, policy)).sum(axis=1), np.arange(STATES) >= 5
     v[has_left] *= 0.2  # of an earlier policy; the others are backed up from them
     for _ in range(300):
-        v = np.where(has_left, v, targets(examination(here, v=v, policy=policy), GAMMA)[RIGHT])
+        v = np.where(has_left, v, targets(examination(here, v=v, policy=policy), GAMMA)[RIGHT_EQUATION])
     each = examination(here, v=v, policy=policy)
     late = each.visits * ~has_left[:, None]
     assert cut_shares(each, GAMMA)[0] > 0.45
@@ -171,7 +171,7 @@ def test_values_with_the_time_limit_as_an_end_are_all_of_the_way():
     here = world(1)
     each = examination(here)
     cuts = each.cuts / np.maximum(each.visits, 1)
-    for name, share in ((RIGHT, 0), ("cut_is_end", 1)):
+    for name, share in ((RIGHT_EQUATION, 0), ("cut_is_end", 1)):
         q = solve(here, name, GAMMA, cuts, at_terminal=0.0)
         assert cut_shares(examination(here, q=q), GAMMA) == pytest.approx((share, share), abs=1e-6)
     assert np.isnan(cut_shares(examination(here, q=q, cuts=0), GAMMA)).all()
@@ -181,9 +181,9 @@ def test_values_with_the_time_limit_as_an_end_are_all_of_the_way():
 def test_the_factor_of_rewards_is_their_slope():
     here = world(3)
     for scale in (0.01, 0.5, 10.0):
-        q = solve(here, RIGHT, GAMMA, np.zeros((STATES, ACTIONS)), scale=scale, at_terminal=0.0)
+        q = solve(here, RIGHT_EQUATION, GAMMA, np.zeros((STATES, ACTIONS)), scale=scale, at_terminal=0.0)
         assert reward_slope(examination(here, q=q), GAMMA) == pytest.approx(np.log10(scale), abs=1e-6)
-    q = solve(here, RIGHT, GAMMA, np.zeros((STATES, ACTIONS)), scale=-1.0, at_terminal=0.0)
+    q = solve(here, RIGHT_EQUATION, GAMMA, np.zeros((STATES, ACTIONS)), scale=-1.0, at_terminal=0.0)
     slope = reward_slope(examination(here, q=q), GAMMA)
     assert slope == -3 or slope < 0
 
@@ -197,8 +197,8 @@ def test_residuals_are_those_of_the_visits_that_are_asked_for():
     assert elsewhere.sum() >= 2
     noise = 3 * q.std() * np.random.default_rng(0).standard_normal((STATES, ACTIONS))
     each, place = examination(here, q=q + elsewhere[:, None] * noise, last=last), GAMMAS.index(GAMMA)
-    assert residuals(each, last)[RIGHT][place] < 1e-6
-    assert residuals(each)[RIGHT][place] > 0.1
+    assert residuals(each, last)[RIGHT_EQUATION][place] < 1e-6
+    assert residuals(each)[RIGHT_EQUATION][place] > 0.1
     assert abs(readings([examination(here, q=q, last=last)])["forgets"]) < 0.05
 
 

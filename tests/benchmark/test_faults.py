@@ -43,9 +43,9 @@ def test_an_update_follows_the_numerical_gradient():
 def test_there_are_two_dozen_faults_and_others_are_refused():
     assert 24 <= sum(map(len, faults.FAULTS.values())) <= 30
     with pytest.raises(UnknownName, match="target_never_copied"):
-        faults.make("dqn", "target_never_copyed")
+        faults.faulty_agent("dqn", "target_never_copyed")
     with pytest.raises(UnknownName, match="dqn"):
-        faults.make("dqm")
+        faults.faulty_agent("dqm")
     with pytest.raises(UnknownName, match="gamma_half"):
         next(faults.ppo(None, 10, 0, fault="gamma_haf"))
 
@@ -54,7 +54,7 @@ def test_there_are_two_dozen_faults_and_others_are_refused():
 @pytest.mark.parametrize("agent", faults.FAULTS)
 def test_each_fault_runs_and_leaves_what_it_says(agent):
     def seen(fault, worlds=("still",), seeds=(0, 1)):
-        return examine(faults.make(agent, fault), worlds=worlds, seeds=seeds, steps=400)
+        return examine(faults.faulty_agent(agent, fault), worlds=worlds, seeds=seeds, steps=400)
 
     for fault in faults.FAULTS[agent]:
         numbers = readings(seen(fault))
@@ -168,7 +168,7 @@ def test_what_is_no_agent_is_refused_in_one_line():
     with pytest.raises(ParameterError, match="yield policy"):
         examine(lambda env, steps, seed: iter(()), worlds=["still"], steps=20)
     with pytest.raises(UnknownName, match="still"):
-        examine(faults.make("dqn"), worlds=["stil"], steps=20)
+        examine(faults.faulty_agent("dqn"), worlds=["stil"], steps=20)
     with pytest.raises(ParameterError, match="is a table"):
         learner_of("q_learning")
     with pytest.raises(ParameterError, match="JAX"):

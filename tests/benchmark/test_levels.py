@@ -11,7 +11,7 @@ import pharos
 from pharos import benchmark
 from pharos.benchmark import BenchmarkTask, Ladder, Protocol, Suite, baselines, frozen, load_suite, read_results, score
 from pharos.benchmark.contents import contents_of
-from pharos.benchmark.levels import FIRST_HELD_OUT, LEVELS, levels_of, overlap, twins
+from pharos.benchmark.levels import ENVIRONMENT_NAME, FIRST_HELD_OUT, levels_of, overlap, twins
 from pharos.benchmark.page import page
 from pharos.benchmark.suite import digest_of_suite
 from pharos.interaction import GymEnv
@@ -25,7 +25,7 @@ EVIDENCE = (Path(__file__).parents[2] / "docs" / "evidence" / "benchmark.md").re
 @pytest.fixture(scope="module")
 def suite():
     seen = BenchmarkTask(
-        "seen", LEVELS, {"world": "frozen_lake", "options": OPTIONS, "train": 2, "held_out": 0}, "recorded"
+        "seen", ENVIRONMENT_NAME, {"world": "frozen_lake", "options": OPTIONS, "train": 2, "held_out": 0}, "recorded"
     )
     held_out = replace(seen, name="held-out", parameters={**seen.parameters, "held_out": 3}, axis="lake", level=1.0)
     seen, held_out = frozen(seen, PROTOCOL), frozen(held_out, PROTOCOL)

@@ -189,7 +189,7 @@ def test_an_older_page_stays_if_the_agent_fails_and_a_link_is_followed(tmp_path)
 
 @pytest.mark.long
 def test_a_function_of_python_is_diagnosed_and_only_in_some_worlds():
-    diagnosis = diagnose(faults.make("ppo", "gamma_half"), worlds=["still", "umbrella"], steps=1500)
+    diagnosis = diagnose(faults.faulty_agent("ppo", "gamma_half"), worlds=["still", "umbrella"], steps=1500)
     assert diagnosis.kind == "ppo" and set(diagnosis.scores) == {"still", "umbrella"}
     assert diagnosis.readings["gamma"] < 0.7
     assert str(diagnosis).startswith("# Diagnosis of ")

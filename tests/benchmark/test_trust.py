@@ -14,7 +14,7 @@ from pharos.benchmark import board
 from pharos.benchmark.execution import run
 from pharos.benchmark.page import report
 from pharos.benchmark.scores import score
-from pharos.benchmark.submission import WHAT, Submission, submit
+from pharos.benchmark.submission import ENTRY_KIND, Submission, submit
 from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite, digest_of_suite, frozen, write_suite
 from pharos.benchmark.verification import verify
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted, TimeLimit
@@ -270,10 +270,10 @@ def test_a_label_of_a_suite_is_the_one_that_was_submitted(suite, honest, tmp_pat
 
 
 def test_a_submission_with_a_commitment_is_read_as_one_without(suite, honest, tmp_path):
-    record, arrays = read_sealed(honest[1], WHAT, lambda *content: content)
+    record, arrays = read_sealed(honest[1], ENTRY_KIND, lambda *content: content)
     kept = {name: value for name, value in record.items() if name not in ("arrays", "digest")}
     write_sealed(
-        tmp_path / "older.safetensors", {**kept, "commitment": {"agent": "x", "date": "2026-01-01"}}, arrays, WHAT
+        tmp_path / "older.safetensors", {**kept, "commitment": {"agent": "x", "date": "2026-01-01"}}, arrays, ENTRY_KIND
     )
     assert verify(tmp_path / "older.safetensors", suite).holds
     Submission.read(tmp_path / "older.safetensors").write(tmp_path / "again.safetensors")

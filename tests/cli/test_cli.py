@@ -170,7 +170,7 @@ def test_list_says_type_range_default_and_meaning(answer):
     assert lake["frozen_probability"] == {
         "default": 0.8,
         "values": "number in [0, 1]",
-        "meaning": "of each tile of a random map to be ice, in (0, 1]; as in Gymnasium 0.8.",
+        "meaning": "of each tile of a random map to be ice, in (0, 1], as in Gymnasium 0.8.",
     }
     assert answer("list", "freeway")["parameters"]["directions"]["values"] == "integers, each 1 (right) or -1 (left)"
 

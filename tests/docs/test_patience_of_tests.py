@@ -8,8 +8,12 @@ from hypothesis import HealthCheck, settings
 from patience import PATIENCE
 
 TESTS = Path(__file__).parents[1]
-LIMIT = re.compile(r"""timeout["']?[=:]\s*[\d.]+|\b(wait|join|alarm)\([1-9][\d.]*\)|deadline=|HealthCheck\.""")
+LIMIT = re.compile(
+    r"""timeout["']?[=:]\s*[\d.]+|\b(wait|join|alarm)\([1-9][\d.]*\)|deadline=|HealthCheck\."""
+    r"""|ITIMER_REAL, (?!PATIENCE|0)\w+"""
+)
 OWN = {
+    "benchmark/test_entries.py": ["ITIMER_REAL, 1e"],  # of the reading of an entry, which is what is tested
     "benchmark/test_profiles.py": ["timeout=0.2"],  # of an agent that hangs, which is what is tested
     "benchmark/test_jax_agents.py": ['timeout": 0.5'],  # as below
     "conftest.py": ["deadline=", "HealthCheck."],
@@ -23,6 +27,7 @@ def limits_in(text):
 
 def test_a_limit_is_found():
     assert limits_in("run(x, timeout=30); p.wait(60); {'timeout': 5}") == ["timeout': 5", "timeout=30", "wait(60)"]
+    assert limits_in("signal.setitimer(signal.ITIMER_REAL, SECONDS)") == ["ITIMER_REAL, SECONDS"]
     assert not limits_in("run(x, timeout=PATIENCE); p.wait(); p.join(timeout=rng.uniform(1, 2))")
 
 

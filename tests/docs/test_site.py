@@ -188,7 +188,8 @@ def test_every_environment_has_a_page(scripts):
         page = pages[f"environments/{name}.md"]
         for heading in ("Rules", "Parameters", "Named instances", "What agents see", "Versions"):
             assert f"\n## {heading}\n" in page, (name, heading)
-        assert page.count("\n| **") >= 3, name
+        paragraphs = page.count("\n| **")
+        assert paragraphs >= 3, f"the docstring of {name} needs paragraphs such as State, Actions, Reward, Ends, Source"
         for instance in cls.instances:
             assert f"| `{name}/{instance}` |" in page
         assert f"{name}.html" in pages["environments/index.md"]

@@ -220,6 +220,12 @@ def test_the_page_names_a_command_that_tests_each_kind():
         assert (ROOT / tests).exists(), row
 
 
+def test_the_page_of_agents_has_a_row_with_every_name():
+    table = (ROOT / "docs" / "agents.md").read_text().partition("\n## Agents\n")[2].partition("\n\n- ")[0]
+    missing = [name for name in agents() if f"`{name}`" not in table]
+    assert not missing, f"docs/agents.md: the table of agents has no row for {missing}"
+
+
 def add(file, before, line):
     """Add a line after the one that begins with `before`; at the end of the file if that is empty."""
     lines = file.read_text().splitlines()

@@ -489,4 +489,6 @@ def test_golden_game_is_played_as_it_was_read(game):
 def test_every_class_has_pictures():
     page = (Path(__file__).parents[2] / "docs" / "worlds.md").read_text().partition("## Pictures\n")[2]
     rows = re.findall(r"^\| \*\*(\w+)\*\* ", page, re.MULTILINE)
+    missing = [each.name for each in BUILT_IN if each.name not in rows]
+    assert not missing, f"docs/worlds.md has no pictures of them: run python scripts/gallery.py {' '.join(missing)}"
     assert sorted(rows) == sorted(each.name for each in BUILT_IN)

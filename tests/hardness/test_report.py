@@ -182,6 +182,16 @@ def spent(mdp, names="all", **options):
     return hardness.report(mdp, names, budget=0, keep=False, **options)
 
 
+OF_ONE_PASS: set[str] = set()  # measures that take no time: a budget does not end them
+
+
+def check_that_all_end(endless):
+    endless = endless - OF_ONE_PASS
+    assert not endless, (
+        f"pass progress=problem.reporter(name) to {endless}; if it takes no time, name it in OF_ONE_PASS"
+    )
+
+
 @pytest.mark.long
 def test_a_spent_budget_ends_every_measure_of_a_world_with_chance():
     space = pharos.build(Lift(floors=3), progress=False)
@@ -191,7 +201,8 @@ def test_a_spent_budget_ends_every_measure_of_a_world_with_chance():
     open_ends = {name for name, result in report.results.items() if result.is_out_of_budget}
     bounded = {name for name, result in report.results.items() if result.certificate.kind == "interval"}
     # what a deterministic MDP alone has says so before any work
-    assert set(report.results) - open_ends - bounded == {"tight_effective_horizon"}
+    check_that_all_end(set(report.results) - open_ends - bounded - {"tight_effective_horizon"})
+    assert "tight_effective_horizon" not in open_ends | bounded
     assert bounded == INTERVALS
     assert all("--budget" in report[name].undefined for name in open_ends)
     assert all("--budget" in report[name].certificate.note for name in bounded)
@@ -204,7 +215,7 @@ def test_a_spent_budget_ends_every_measure_of_a_world_without_chance():
     report = spent(grid(), horizon=6, representation=pharos.observations.representation(grid_space(), "vector"))
     ended = {name for name, result in report.results.items() if result.is_out_of_budget}
     certain = {"diameter", "start_eccentricity", "environmental_value_norm"}  # one search; 0 without chance
-    assert set(report.results) - ended <= certain | {"mixing_time"}
+    check_that_all_end(set(report.results) - ended - certain - {"mixing_time"})
     assert "tight_effective_horizon" in ended and "covering" in ended and "kernel_regret" in ended
 
 

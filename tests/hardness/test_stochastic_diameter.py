@@ -343,7 +343,7 @@ def test_residuals_count_their_rounding():
     matrix = rng.multinomial(2**20, np.full(6, 1 / 6), (6, 2)) / 2**20
     times = HittingTimes(ExpandedMDP.of(TabularMDP.from_matrices(matrix, np.zeros((6, 2))), restart=False))
     count, size = times.distances(0), len(times.goal)
-    arguments = (*times.arrays, times.goal, times.order, count)
+    arguments = (times.rows, times.goal, times.order[:count])
 
     def changes(j):
         """T J - J of the nodes 1 to 5; node 0 is the target."""
@@ -356,11 +356,11 @@ def test_residuals_count_their_rounding():
         high = rng.random(size) * 10.0 ** rng.integers(0, 12)
         low = rng.uniform(-1, 1, size) * high * 2.0**-54
         high[times.goal] = low[times.goal] = 0.0
-        above, below, _ = hitting.residual_bounds(*arguments, high, None, times.policy, None, None)
+        above, below, _ = hitting.residual_bounds(*arguments, high, None, times.policy, None)
         exact = changes([Fraction(float(value)) for value in high])
         assert -Fraction(below) <= min(exact) and max(exact) <= Fraction(above)
         residual, error = np.zeros(size), np.zeros(size)
-        hitting.residual_bounds(*arguments, high, low, times.policy, residual, error)
+        hitting.residual_bounds(*arguments, high, low, times.policy, (residual, error))
         exact = changes([Fraction(float(one)) + Fraction(float(two)) for one, two in zip(high, low, strict=True)])
         for n, change in enumerate(exact, start=1):
             assert abs(change - Fraction(float(residual[n]))) <= Fraction(float(error[n]))

@@ -145,7 +145,7 @@ def test_long_compiling_says_what_it_compiles(monkeypatch):
     assert words.startswith("pharos: compiling explore for breakout, kernel ") and words.count("\n") == 1
     assert words.endswith(" s so far; kept for the next time\n")
     # the next line is due some seconds of compiling later
-    assert compiling._next > compiling.TOLD_EVERY
+    assert compiling._next > compiling.NOTICE_EVERY
     assert toy("sweep", lambda: None)(1) == 2 and said.getvalue() == words
     said.event.clear()
     monkeypatch.setattr(compiling, "_next", 0.0)

@@ -156,6 +156,31 @@ def test_every_representation_gives_the_same_answers(mdp, seed):
     assert (mdp.dynamics.push_forward(mass)[:, 0] * values[:-1]).sum() == pytest.approx(adjoint)
 
 
+@pytest.mark.slow
+@examples(40, st.one_of(small_mdps(), outcome_mdps(), lazy_mdps()), st.integers(0, 2**32))
+def test_every_representation_is_cut_merged_and_drawn_alike(mdp, seed):
+    rng = np.random.default_rng(seed)
+    size, num_actions = mdp.num_states, mdp.num_actions
+    all_of_them = [each for each in representations(mdp) if not isinstance(each, Listed)]
+    states = np.flatnonzero(rng.random(size) < 0.7)
+    classes = np.unique(rng.integers(0, size, size), return_inverse=True)[1]
+    representatives = np.array([np.flatnonzero(classes == c)[0] for c in range(classes.max() + 1)])
+    start, stop = sorted(rng.integers(0, size + 1, 2))
+    if len(states):
+        same([each.restricted_to(states).matrix().toarray() for each in all_of_them])
+    same([each.merged(classes, representatives).matrix().toarray() for each in all_of_them])
+    if start < stop:
+        values = rng.normal(size=size + 1)
+        parts = [each.part(start, stop) for each in all_of_them]
+        same([halo for _, halo in parts])
+        same([part.expected(np.append(values[start:stop], values[[*halo, -1]])) for part, halo in parts])
+    pairs = rng.integers(0, size, 30), rng.integers(0, num_actions, 30)
+    probabilities = mdp.dynamics.matrix().toarray()[pairs[0] * num_actions + pairs[1]]
+    for each in all_of_them:
+        drawn = each.sample(*pairs, rng)  # -1 for the end, which is the last column
+        assert (probabilities[np.arange(30), drawn] > 1e-12).all()
+
+
 @pytest.mark.long
 @examples(80, st.one_of(small_mdps(), with_chance(outcome_mdps()), lazy_mdps()), st.integers(0, 2**32))
 def test_compiled_backups_and_moves_are_those_of_the_formulas(mdp, seed):

@@ -1,6 +1,7 @@
 """Observations: pure functions of the state, batched, with their spaces; user-defined ones are checked."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 
 import pharos
 from patience import PATIENCE
-from pharos import observations
+from pharos import importers, observations
 from pharos.errors import ParameterError, UnknownName
 from refusals import refusal
 from strategies import examples
@@ -21,6 +22,7 @@ SMALL = {
     "freeway": {"num_cars": 3, "lane_length": 4, "player_speed": 2},
     "breakout": {"height": 7, "columns": 4},
 }
+PAGE = (Path(__file__).parents[2] / "docs" / "observations.md").read_text()
 
 
 @pytest.fixture(params=SMALL, scope="module")
@@ -70,6 +72,35 @@ def test_an_index_is_the_number_of_the_state_in_its_space(tmp_path):
         observations.observe(env, "index")
     with pytest.raises(ParameterError, match="belongs to Breakout"):
         observations.observe(pharos.make("breakout", height=8, columns=4), "index", state_space=space)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", observations.names())
+def test_every_observation_keeps_its_space_and_sees_each_state_alone(name, tmp_path):
+    assert f"| `{name}` |" in PAGE, f"docs/observations.md: the table has no row for {name}"
+    mdp = pharos.TabularMDP.from_arrays(np.array([[1, 2], [2, -1], [0, 1]]), np.ones((3, 2)), gamma=0.9)
+    shown = np.arange(3 * 6 * 7 * 3, dtype=np.uint8).reshape(3, 6, 7, 3)
+    importers.save(mdp, tmp_path / "imported", observations=shown)
+    worlds = [pharos.make("simple_grid", **SMALL["simple_grid"]), pharos.make(str(tmp_path / "imported"))]
+    num_worlds = 0
+    for i, env in enumerate(worlds):
+        space = pharos.build(env, tmp_path / f"space-{i}", progress=False)
+        try:
+            observation = observations.observe(env, name, state_space=space)
+        except ParameterError:
+            continue  # the world has no such observation
+        num_worlds += 1
+        assert (observation.name, observation.env) == (name, env)
+        states = space.states(np.arange(space.num_states))
+        batch = observation(states)
+        assert batch.shape == (len(states), *observation.space.shape)
+        for state, row in zip(states, batch, strict=True):
+            assert observation.space.contains(row), f"{observation}: of state {state.tolist()} it is {row!r}"
+            assert (observation.one(state) == row).all(), "one state alone looks as in a batch"
+        expected = batch.copy()
+        batch[...] = 1 - batch
+        assert (observation(states) == expected).all(), "a batch is a fresh array: whoever gets it may write to it"
+    assert num_worlds, f"no world of this test has {name}: add one to `worlds`"
 
 
 def ball(env, states):

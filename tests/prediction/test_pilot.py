@@ -13,7 +13,7 @@ from benchmark_modules import benchmark
 from pharos.agents import primary_predictors
 from pharos.errors import ParameterError
 from pharos.prediction import pilot
-from pharos.prediction.pilot import SHARES, Plane, cut, pilot_regret, plane
+from pharos.prediction.pilot import PILOT_SHARES, Plane, cut, pilot_regret, plane
 from pharos.training import Task
 
 PAGE = (Path(__file__).parents[2] / "docs" / "prediction.md").read_text(encoding="utf-8")
@@ -25,7 +25,7 @@ def epsilon(settings, step, steps):
     return first + (last - first) * min(1.0, step / (settings["exploration_fraction"] * steps))
 
 
-@pytest.mark.parametrize("share", SHARES)
+@pytest.mark.parametrize("share", PILOT_SHARES)
 @pytest.mark.parametrize("fraction", [0.05, 0.25, 0.3, 1.0])
 def test_a_cut_run_explores_as_the_beginning_of_the_whole_one(share, fraction):
     whole = {"exploration_initial_eps": 1.0, "exploration_final_eps": 0.05, "exploration_fraction": fraction}
@@ -50,13 +50,13 @@ def test_a_plane_gives_back_a_plane_and_weighs_classes_alike():
 
 @pytest.mark.parametrize("agent", primary_predictors())
 def test_published_pilots_are_those_of_the_page(agent):
-    with pilot.FILE.open(newline="", encoding="utf-8") as file:
+    with pilot.PILOTS_FILE.open(newline="", encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file) if row["agent"] == agent]
     assert len(rows) == 98 and len({row["environment"] for row in rows}) == 14
-    widths = [plane(agent, share).calibration.half_width() for share in SHARES]
+    widths = [plane(agent, share).calibration.half_width() for share in PILOT_SHARES]
     said = re.search("± ([0-9., and]+) for " + agent.upper(), " ".join(PAGE.split()))[1]
     assert [float(each) for each in re.findall("[0-9.]+", said)] == [round(width, 2) for width in widths]
-    assert all(0.7 < plane(agent, share).calibration.coverage() < 0.9 for share in SHARES)
+    assert all(0.7 < plane(agent, share).calibration.coverage() < 0.9 for share in PILOT_SHARES)
 
 
 @pytest.mark.long
@@ -96,6 +96,6 @@ def test_the_score_of_a_pilot_lies_between_those_of_its_neighbours():
 
 def test_scores_of_pilots_are_those_of_the_page():
     cells = benchmark("prediction_cells")
-    for agent, words, values in cells.r_squared_of_pilots(cells.FILE):
+    for agent, words, values in cells.r_squared_of_pilots(cells.CELLS_FILE):
         texts = [f"{value:.2f}" for value in values] + [""] * (len(cells.SHARES) - len(values))
         assert f"| {agent.upper()} | {words} | {' | '.join(texts)} |" in PAGE

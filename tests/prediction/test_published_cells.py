@@ -82,7 +82,7 @@ def lines_of(capsys, task, *arguments):
 def test_the_pages_have_the_numbers_of_the_cells(cells, capsys):
     pages = ("evidence/sealed-2.md", "evidence/sealed-1.md", "prediction.md")
     evidence, first, page = ((DOCS / name).read_text(encoding="utf-8") for name in pages)
-    lines = lines_of(capsys, cells.judge, cells.FILE, 1000)
+    lines = lines_of(capsys, cells.judge, cells.CELLS_FILE, 1000)
     assert len(lines) == 8
     for line in lines:
         assert line in evidence
@@ -91,9 +91,9 @@ def test_the_pages_have_the_numbers_of_the_cells(cells, capsys):
             assert f"| {agent} | {count} | {r_squared} | {rho} | {pairs} | {width} | {coverage} |" in page
         if (name, agent) == ("the first fourteen sealed", "DQN"):
             assert f"| DQN | `sampled_regret`, named before the second | {r_squared}, known by then |" in page
-    for line in [*lines_of(capsys, cells.orders, cells.FILE), *lines_of(capsys, cells.pilots, cells.FILE)]:
+    for line in [*lines_of(capsys, cells.orders, cells.CELLS_FILE), *lines_of(capsys, cells.pilots, cells.CELLS_FILE)]:
         assert line in page
-    tested = lines_of(capsys, cells.sealed, cells.FILE, 1000)
+    tested = lines_of(capsys, cells.sealed, cells.CELLS_FILE, 1000)
     assert len(tested) == 13
     r_squared = {}
     for line in tested:

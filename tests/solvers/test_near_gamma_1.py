@@ -59,7 +59,7 @@ def test_large_systems_are_solved_inexactly_and_agree_with_sweeps():
     rewards[size * size // 2] = 1.0
     mdp = random_actions(TabularMDP.from_arrays(table, rewards, gamma=0.9999), 0.5)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(policy_iteration, "MOST_ENTRIES", 0)
+        patch.setattr(policy_iteration, "MOST_CHOICES", 0)
         solution = value_iteration(mdp, 1e-6)
         patch.setattr(PolicyIteration, "is_worth_it", lambda *_: False)
         swept = value_iteration(mdp, 1e-2)

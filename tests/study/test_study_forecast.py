@@ -16,7 +16,7 @@ def test_a_study_says_before_its_first_run_what_is_missing_at_the_pace_of_finish
 
     def run(seeds):
         spec = {"name": "fake", "steps": 100, "blocks": [block], "seeds": seeds}
-        study.run(spec, tmp_path, runner=fake_training.train, workers=2, foretold=told.append)
+        study.run(spec, tmp_path, runner=fake_training.train, workers=2, on_forecast=told.append)
         return sum(study.table(spec, tmp_path)["seconds"]) / seeds
 
     pace = run(2)

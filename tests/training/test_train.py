@@ -20,6 +20,7 @@ import pytest
 
 import pharos
 from patience import PATIENCE, wait_for
+from pharos.agents import agents
 from pharos.agents.sb3 import Deep, check_hyperparameters
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted, UnknownName
 from pharos.training import read_curve, read_record, train, train_config
@@ -44,7 +45,7 @@ def short(agent, out=None, steps=400, seed=1, progress=None, **options):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("agent", ["q_learning", "dqn", "ppo"])
+@pytest.mark.parametrize("agent", agents())
 def test_a_run_writes_its_record_and_its_curve(agent, tmp_path):
     result = short(agent, tmp_path / "run", observation="vector", sticky=0.25)
     record, curve = read_record(tmp_path / "run"), read_curve(tmp_path / "run")
@@ -58,7 +59,7 @@ def test_a_run_writes_its_record_and_its_curve(agent, tmp_path):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("agent", ["q_learning", "dqn", "ppo"])
+@pytest.mark.parametrize("agent", agents())
 def test_the_same_seed_gives_the_same_file_and_another_seed_another(agent, tmp_path):
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
         short(agent, tmp_path / name, seed=seed, observation="simple_image")
@@ -113,7 +114,7 @@ def kill_at(step):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("agent", ["q_learning", "dqn", "ppo"])
+@pytest.mark.parametrize("agent", agents())
 def test_a_run_that_died_goes_on_from_its_last_checkpoint(agent, tmp_path):
     with pytest.raises(Killed):
         short(agent, tmp_path / "run", progress=kill_at(300))
@@ -122,7 +123,7 @@ def test_a_run_that_died_goes_on_from_its_last_checkpoint(agent, tmp_path):
     result = short(agent, tmp_path / "run", progress=lambda done, *_: steps.append(done))
     assert steps == [300, 400]
     assert [row["step"] for row in result.curve] == [0, 100, 200, 300, 400]
-    if agent == "q_learning":
+    if agents()[agent].resumes_exactly("sb3"):
         short(agent, tmp_path / "whole")
         assert (tmp_path / "run" / "curve.csv").read_bytes() == (tmp_path / "whole" / "curve.csv").read_bytes()
 

@@ -4,7 +4,7 @@ trains them on a task.
 
 from pharos.agents import batched
 from pharos.agents.agent import (
-    LIBRARIES,
+    AGENT_LIBRARIES,
     NETWORK,
     POLICY,
     TABULAR_OBSERVATION,

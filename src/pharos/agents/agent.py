@@ -1,4 +1,4 @@
-"""Agents: one object for each has all that pharos knows about it; and what a learner of several runs can do.
+"""Agents: one object for each has all that pharos knows about it, and what a learner of several runs can do.
 
 A new agent is a file with its object and a line in registry.py. Everything else asks the object: `train`, `tune`,
 studies, `predict`, the benchmark, figures and the command line.
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 POLICY, NETWORK = "policy.npy", "agent"
 """What was learnt, in the folder of a run: a table, or a folder with a network."""
-LIBRARIES = ("stable_baselines3", "sb3_contrib")
+AGENT_LIBRARIES = ("stable_baselines3", "sb3_contrib")
 """Their algorithms are known by name: they need no trust, and no source in the configuration of a run."""
 TABULAR_OBSERVATION = "index"
 """What tabular agents see."""
@@ -149,7 +149,7 @@ class Learner(Protocol):
     """Learner of N runs. One without `save` begins anew after it was killed.
 
     Attributes:
-        episodes: (N,) int64, finished ones; returns: (N,) float64, the sums of their returns.
+        episodes: (N,) int64, finished ones. returns: (N,) float64, the sums of their returns.
     """
 
     @property
@@ -162,10 +162,10 @@ class Learner(Protocol):
         """Train until the last of `points`, and call `at_point` at each."""
 
     def policy(self, i: int) -> PolicyLike:
-        """The policy of run i, as `evaluate_agent` takes it; or its value, if the learner knows that."""
+        """The policy of run i, as `evaluate_agent` takes it, or its value, if the learner knows that."""
 
     def greedy_actions(self, indices: Sequence[int]) -> dict[int, np.ndarray] | None:
-        """(S,) greedy actions by run; None if no policy is a table of states."""
+        """(S,) greedy actions by run, or None if no policy is a table of states."""
 
     def save(self, folder: Path) -> None:
         """Write the state that `load` goes on from."""
@@ -187,17 +187,17 @@ class Agent:
     Attributes:
         name: as `train` takes it.
         title: as figures and tables write it.
-        engines: that can be asked for; the last trains most runs a second.
-        defaults: hyperparameters, under the names of Stable-Baselines3 or of the learner, `n_envs` beside them; a class
+        engines: that can be asked for. The last trains most runs a second.
+        defaults: hyperparameters, under the names of Stable-Baselines3 or of the learner, `n_envs` beside them. A class
             of environments declares what suits it better.
         space: that `tune` searches: of each hyperparameter ("log", low, high), ("linear", low, high), or ("one of",
             value, ...).
-        benchmark_defaults: what only some classes of environments declare; the benchmark has one setting for all tasks.
+        benchmark_defaults: what only some classes of environments declare. The benchmark has one setting for all tasks.
         idealised: the learner that `predict` computes in its place.
         relatives: words in names of algorithms that are of its kind.
-        fixed_observation: what it always sees; None: what is asked for.
+        fixed_observation: what it always sees. None: what is asked for.
         is_greedy: whether its policies are one action in each observation.
-        has_table: whether it learns a table over the states, stored as POLICY; else a network, stored in NETWORK.
+        has_table: whether it learns a table over the states, stored as POLICY. Otherwise a network, stored in NETWORK.
     """
 
     name: str
@@ -235,14 +235,14 @@ class Agent:
         return False
 
     def library_default(self, name: str) -> object:
-        """The learner's own default of a hyperparameter; None if it has none."""
+        """The learner's own default of a hyperparameter, or None if it has none."""
         return None
 
     def check(self, hyperparameters: Mapping[str, Any], engine: str) -> None:
         """Raise ParameterError or UnknownName for hyperparameters that the agent lacks, or whose values are wrong."""
 
     def group_key(self, run: PlannedRun, device: str) -> Hashable | None:
-        """Key of a run before its states are built: only runs with equal keys may train together; None: it is alone."""
+        """Key of a run before its states are built: only runs with equal keys may train together. None: it is alone."""
         return None
 
     def width(self, run: PlannedRun, device: str) -> int:
@@ -250,7 +250,7 @@ class Agent:
         return 1
 
     def prepare(self, run: LearningRun, device: str, *, is_single: bool) -> Hashable | None:
-        """Return the exact group key of a run: runs with equal keys train under one learner; None: it is alone.
+        """Return the exact group key of a run: runs with equal keys train under one learner. None: it is alone.
 
         Args:
             is_single: whether the run is the only one of its call, or has a checkpoint of its own.
@@ -287,8 +287,8 @@ def register(agent: Agent) -> None:
 
 
 def is_known(name: str) -> bool:
-    """Whether an agent comes with pharos or with one of LIBRARIES, so that it is not code of the user's own."""
-    return not is_reference(name) or name.partition(":")[0].split(".")[0] in LIBRARIES
+    """Whether an agent comes with pharos or with one of AGENT_LIBRARIES, so that it is not code of the user's own."""
+    return not is_reference(name) or name.partition(":")[0].split(".")[0] in AGENT_LIBRARIES
 
 
 # Tables ---------------------------------------------------------------------------------------------------------------
@@ -321,7 +321,7 @@ class TableLearner(Protocol):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TableBasedAgent(Agent):
-    """An agent that learns a table over the states, whose index it sees; runs on few states train together.
+    """An agent that learns a table over the states, whose index it sees. Runs on few states train together.
 
     Tables are the same with each engine, so theirs is always "sb3".
     """
@@ -403,7 +403,7 @@ class Tables(ArrayLearner):
         return self.tables[i]
 
     def greedy_actions(self, indices: Sequence[int]) -> dict[int, np.ndarray]:
-        """(S,) greedy actions by index of the run; runs whose policy depends on the previous action are left out."""
+        """(S,) greedy actions by index of the run. Runs whose policy depends on the previous action are left out."""
         tables = {i: self.tables[i].policy_table() for i in indices}
         return {i: table for i, table in tables.items() if table.ndim == 1}
 
@@ -464,7 +464,7 @@ def read_policy_table(folder: Path) -> np.ndarray:
 
 
 def new_agent(folder: Path) -> Path:
-    """The empty folder NETWORK of a run; an older one is removed, so that no link in it is written through."""
+    """The empty folder NETWORK of a run. An older one is removed, so that no link in it is written through."""
     target = storage.inside(folder, NETWORK)
     shutil.rmtree(target, ignore_errors=True)
     target.mkdir(parents=True)

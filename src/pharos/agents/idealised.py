@@ -37,7 +37,7 @@ class Idealised:
     Attributes:
         kind: "dqn", "ppo", "table" or "both", the one that the benchmark compares the agent with.
         predictor: the column that stands for the agent, named on twelve development classes and fourteen sealed ones
-            together; empty if there is none.
+            together. Empty if there is none.
         initialisation: of the network, see `pharos.observations.representation`.
         suffix: of the network's name.
     """
@@ -70,7 +70,7 @@ class Idealised:
         raise NotImplementedError
 
     def primary_columns(self, value: Mapping[str, Any] | None) -> dict[str, Any]:
-        """Columns of the value of `primary`; NaN if there is none."""
+        """Columns of the value of `primary`, NaN if there is none."""
         return {}
 
     def regret(self, value: Mapping[str, Any]) -> float:
@@ -126,7 +126,7 @@ class IdealisedActorCritic(Idealised):
     """The idealised actor-critic: `kernel_policy_regret`.
 
     Attributes:
-        gae_lambda, clip_range: of the agent if its hyperparameters do not say; no clip_range: it has no clipping.
+        gae_lambda, clip_range: of the agent if its hyperparameters do not say. Without clip_range it has no clipping.
     """
 
     kind: str = "ppo"

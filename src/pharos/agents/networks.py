@@ -5,7 +5,7 @@ from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-NATURE = 36  # pixels from which the strides of Mnih et al. (2015) fit
+from pharos.agents.batched.runs import NATURE_PIXELS
 
 
 class SmallMLP(BaseFeaturesExtractor):
@@ -22,12 +22,12 @@ class SmallMLP(BaseFeaturesExtractor):
 
 
 class SmallCNN(BaseFeaturesExtractor):
-    """16 filters of 3 x 3, stride 1 (MinAtar); from 36 pixels on, the three convolutions of Mnih et al. (2015)."""
+    """16 filters of 3 x 3, stride 1 (MinAtar). From 36 pixels on, the three convolutions of Mnih et al. (2015)."""
 
     def __init__(self, observation_space: spaces.Box, features_dim: int = 128):
         super().__init__(observation_space, features_dim)
         channels, height, width = observation_space.shape
-        if min(height, width) < NATURE:
+        if min(height, width) < NATURE_PIXELS:
             convolutions = [nn.Conv2d(channels, 16, 3, padding=1), nn.ReLU()]
         else:
             convolutions = [

@@ -36,21 +36,21 @@ class QLearning:
     belongs to the chosen action, as the agent does not know which one was executed.
 
     Args:
-        mdp: the MDP, with chance; its horizon is the time limit of episodes.
+        mdp: the MDP, with chance. Its horizon is the time limit of episodes.
         total_steps: over which exploration is scheduled.
-        seed: of all random numbers; the same seed gives the same table, whatever the pieces that `learn` is called in.
-        reward_noise, reward_delay: how r is paid, as `pharos.interaction.Interaction` has it; returns are of what is
+        seed: of all random numbers. The same seed gives the same table, whatever the pieces that `learn` is called in.
+        reward_noise, reward_delay: how r is paid, as `pharos.interaction.Interaction` has it. Returns are of what is
             earned.
-        learning_rate: alpha, in (0, 1]; with visits_exponent w > 0, alpha = max(learning_rate, n^-w) at the n-th update
+        learning_rate: alpha, in (0, 1]. With visits_exponent w > 0, alpha = max(learning_rate, n^-w) at the n-th update
             of a pair.
         gamma: discount of the agent.
         exploration_initial_eps, exploration_final_eps, exploration_fraction: epsilon goes from the first to the second
-            over this share of total_steps, then stays; exploration_schedule: "linear" or "exponential".
-        initial_q: every entry at the start; larger than any value: optimistic.
+            over this share of total_steps, then stays. exploration_schedule: "linear" or "exponential".
+        initial_q: every entry at the start. It is optimistic if it is larger than any value.
         sees_previous_action: a row for each (state, previously executed action) instead of for each state.
     Raises:
         ParameterError: an option is unknown or out of range.
-    Cost: 15 to 60 ns a step; memory 16 bytes for each state and action.
+    Cost: 15 to 60 ns a step. Memory 16 bytes for each state and action.
     """
 
     def __init__(

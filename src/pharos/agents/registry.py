@@ -1,19 +1,19 @@
-"""Agents by name: those of pharos, a line for each; agents of the user's own; and the hyperparameters of all of them.
+"""Agents by name: those of pharos, a line for each, agents of the user's own, and the hyperparameters of all of them.
 
 An agent of the user's own is named `module:Name` or `file.py:Name`. What the name stands for says how it is trained:
 
     class        an algorithm with Stable-Baselines3's interface
-    generator    learn(env, steps, seed), which yields policies as it learns; or a class with act, observe and policy,
+    generator    learn(env, steps, seed), which yields policies as it learns, or a class with act, observe and policy,
                  whose steps are taken for it (`generator_of`)
     jax          learn(env, params, steps, key) -> (apply, snapshots), which is compiled
 
 What stands behind a `*` in the parameters of a function are its hyperparameters: learn(env, steps, seed, *, rate=0.1);
 of a class with act, observe and policy it is what its constructor takes beside MADE_WITH.
-A name is recognised here for all, `train`, `tune`, studies and the benchmark; a further form is a line of `form_of`.
+A name is recognised here for all, `train`, `tune`, studies and the benchmark. A further form is a line of `form_of`.
 
 Hyperparameters follow RL Zoo's convention, by agent, class of environments and observation. Each agent has defaults
-(`Agent.defaults`); a class of environments declares what suits it better (`Environment.hyperparameters`). A table of
-one's own, in YAML, has both.
+(`Agent.defaults`). A class of environments declares what suits it better (`Environment.hyperparameters`). Your own
+table, in YAML, has both.
 """
 
 import contextlib
@@ -52,7 +52,7 @@ _FUNCTION_LEARNERS: dict[str, FunctionLearner] = {}
 
 
 def agent_called(name: str) -> Agent:
-    """The agent of a name; any other name belongs to a class or function, of a library or the user's own."""
+    """The agent of a name. Any other name belongs to a class or function, of a library or the user's own."""
     kind = DeepAgent if is_known(name) else OwnAgent
     return agents().get(name) or kind(name=name, title=name.rpartition(":")[2], path=name)
 
@@ -70,7 +70,7 @@ def hyperparameters(
     Args:
         given: go before all others.
         table: a YAML that says all of it (agent, then "default" or the class, then "default" or the observation), such
-            as one that `pharos tune` wrote; None for what pharos and the class declare.
+            as one that `pharos tune` wrote. None for what pharos and the class declare.
     Raises:
         ParameterError: the table has another form. MissingExtra: a table is given, and PyYAML is not installed.
     """
@@ -98,7 +98,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _is_table(entry: object, levels: int) -> bool:
-    """Whether an entry is a dictionary nested to this depth; a default has one level, and None stands for no entry."""
+    """Whether an entry is a dictionary nested to this depth. A default has one level, and None stands for no entry."""
     if not isinstance(entry, dict) or not all(isinstance(name, str) for name in entry):
         return False
     below = entry.items() if levels > 1 else ()
@@ -109,7 +109,7 @@ def _is_table(entry: object, levels: int) -> bool:
 
 
 def register_form(form: str, learner: FunctionLearner) -> None:
-    """Say who trains the functions of a form; `pharos.training` does, as their policies are evaluated there."""
+    """Say who trains the functions of a form. `pharos.training` does, as their policies are evaluated there."""
     _FUNCTION_LEARNERS[form] = learner
 
 
@@ -142,8 +142,9 @@ def generator_of(code: Callable[..., Any]) -> Callable[..., Iterator[PolicyLike]
     """An agent of the form GENERATOR as a function learn(env, steps, seed, **hyperparameters).
 
     A class is made with MADE_WITH, num_envs = 1. Each step asks `act(observations)`, arrays (1, ...), for (1,) actions,
-    and ends with `observe(observations, actions, rewards, next_observations, terminated, truncated)`; next_observations
-    are those before a reset. At each evaluation `policy(observations)`, of any number of them, is what it has learnt.
+    and ends with `observe(observations, actions, rewards, next_observations, terminated, truncated)`, in which
+    next_observations are those before a reset. At each evaluation `policy(observations)`, of any number of them, is
+    what it has learnt.
     """
     if not isinstance(code, type):
         return code
@@ -177,11 +178,11 @@ def generator_of(code: Callable[..., Any]) -> Callable[..., Iterator[PolicyLike]
 def agent_source(
     agent: str | Callable[..., Any], folder: str | Path | None = None, *, check: bool = True
 ) -> Source | None:
-    """Place of the code of a user's own agent; None for all others.
+    """Place of the code of a user's own agent, or None for all others.
 
     Args:
-        agent: a name; or the class or function itself, which then has this name in this process.
-        folder: relative files and modules are looked for there first; None: in the current directory.
+        agent: a name, or the class or function itself, which then has this name in this process.
+        folder: relative files and modules are looked for there first. Default: the current directory.
         check: whether it is imported, to see that it is an agent.
     Raises:
         ParameterError: it cannot be imported, or is no agent.

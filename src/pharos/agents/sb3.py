@@ -1,7 +1,7 @@
 """Algorithms of Stable-Baselines3 on tasks of pharos: the same network everywhere, apart from the feature extractor.
 
 Vectors go through one hidden layer, images through one convolution and one hidden layer (the network of MinAtar: Young
-and Tian, 2019), both to 128 features; then follows one hidden layer. So a difference between observations is one
+and Tian, 2019), both to 128 features. Then follows one hidden layer. So a difference between observations is one
 between representations, not between networks (the pharos paper, section 4.2).
 
 `DeepAgent` is an agent that trains alone, `BatchedAgent` one that the batched engine has as well.
@@ -48,11 +48,14 @@ if TYPE_CHECKING:
 
 EXTRACTED_FEATURES = 128
 LEAST_ONE = ("n_envs", "n_steps", "n_epochs", "batch_size", "buffer_size", "train_freq", "target_update_interval")
-SHARES = ("gamma", "gae_lambda", "tau", "exploration_fraction", "exploration_initial_eps", "exploration_final_eps")
+SHARE_OPTIONS = (
+    *("gamma", "gae_lambda", "tau"),
+    *("exploration_fraction", "exploration_initial_eps", "exploration_final_eps"),
+)
 POSITIVE = ("learning_rate", "clip_range", "max_grad_norm")
 NOT_NEGATIVE = ("learning_starts", "ent_coef", "vf_coef")
 # What `make_model` gives itself.
-OURS = {"env", "seed", "device", "tensorboard_log", "_init_setup_model"}
+RESERVED_ARGUMENTS = {"env", "seed", "device", "tensorboard_log", "_init_setup_model"}
 NO_NORMALIZER = (
     "leave it out, as `vector` is in [0, 1] and rewards are small; or train behind VecNormalize yourself, and evaluate "
     "with pharos.evaluate_policy, which applies it"
@@ -69,7 +72,7 @@ ZOO = {
 
 
 def algorithm(agent: str | Callable[..., Any]) -> type:
-    """The class of an algorithm: the name of an agent, "module:Class" or "file.py:Class"; or a class itself.
+    """The class of an algorithm: the name of an agent, "module:Class" or "file.py:Class", or a class itself.
 
     Raises:
         UnknownName: no such name or class. ParameterError: no such module or file, or something else than a class.
@@ -103,7 +106,7 @@ def algorithm(agent: str | Callable[..., Any]) -> type:
 
 
 def _class(agent: object, target: object, base: type = object) -> type:
-    """Return what an agent's name stands for if it is a class; what else a module has is neither called nor read."""
+    """Return what an agent's name stands for if it is a class. Anything else in a module is neither called nor read."""
     if not isinstance(target, type) or not issubclass(target, base):
         raise ParameterError(
             f"agent {str(agent)[:60]!r}: found {str(target)[:60]}; expected the class of an algorithm for "
@@ -120,8 +123,8 @@ def check_hyperparameters(
     Args:
         also: names that the engine adds to the algorithm's.
     Raises:
-        UnknownName: with the nearest name that it has. ParameterError: a number out of its range, or something else for
-            one; or RL Zoo's wrappers.
+        UnknownName: with the nearest name that it has. ParameterError: a number out of its range, something else for
+        one, or RL Zoo's wrappers.
     """
     name = _title(agent)
     parameters = inspect.signature(algorithm(agent)).parameters
@@ -129,7 +132,7 @@ def check_hyperparameters(
         if hyperparameter in hyperparameters and hyperparameter not in parameters:
             raise ParameterError(f"agent {name!r}: {hyperparameter} is RL Zoo's, for wrappers; {remedy}")
     if all(each.kind is not inspect.Parameter.VAR_KEYWORD for each in parameters.values()):
-        names = sorted({*parameters, "n_envs", "n_timesteps", "net_arch", *also} - OURS)
+        names = sorted({*parameters, "n_envs", "n_timesteps", "net_arch", *also} - RESERVED_ARGUMENTS)
         for hyperparameter in hyperparameters:
             if hyperparameter not in names:
                 raise UnknownName(f"hyperparameter of {name}", hyperparameter, names)
@@ -165,13 +168,13 @@ def _title(agent: str | Callable[..., Any]) -> str:
 
 
 def _expected(name: str, value: object) -> str | None:
-    """Expected type of a hyperparameter if `value` has another one; schedules and the like pass."""
+    """Expected type of a hyperparameter if `value` has another one. Schedules and the like pass."""
     if not isinstance(value, int | float | str):
         return None
     number = value if not isinstance(value, bool | str) else math.nan
     if name in LEAST_ONE and not (number >= 1 and float(number).is_integer()):
         return "an integer of at least 1"
-    if name in SHARES and not 0 <= number <= 1:
+    if name in SHARE_OPTIONS and not 0 <= number <= 1:
         return "a number from 0 to 1"
     if name in POSITIVE and not 0 < number < math.inf:
         return "a number above 0"
@@ -206,8 +209,8 @@ def make_model(
     Args:
         agent: as for `algorithm`.
         env: a VecEnv of Stable-Baselines3.
-        hyperparameters: of the algorithm; `net_arch` for the layers after the features; `n_envs` and `n_timesteps` are
-            left out.
+        hyperparameters: of the algorithm, with `net_arch` for the layers after the features. `n_envs` and `n_timesteps`
+            are left out.
     Raises:
         ParameterError: the algorithm does not know a hyperparameter (`check_hyperparameters` says so better), or does
             not fit the environment.
@@ -301,12 +304,12 @@ class BatchedAgent(DeepAgent):
     engines: tuple[str, ...] = ("sb3", "batched")
 
     def check(self, hyperparameters: Mapping[str, Any], engine: str) -> None:
-        from pharos.agents.batched import OURS, supports
+        from pharos.agents.batched import OWN_OPTIONS, supports
 
         if engine == "sb3":
             super().check(hyperparameters, engine)
             return
-        check_hyperparameters(self.name, hyperparameters, OURS)
+        check_hyperparameters(self.name, hyperparameters, OWN_OPTIONS)
         lacking = supports(self.name, hyperparameters)
         if lacking is not None:
             raise ParameterError(f"the batched engine: {lacking}; the engine sb3 has it")
@@ -345,7 +348,7 @@ def _model(run: LearningRun, logs: Path | None = None) -> "Deep":
 
 
 def _batch_run(run: LearningRun) -> "BatchRun":
-    """A run as the batched engine takes it; runs share observations, rewards of outcomes and rewards of staying."""
+    """A run as the batched engine takes it. Runs share observations, rewards of outcomes and rewards of staying."""
     from pharos.agents.batched import BatchRun, ObservationSource
     from pharos.mdp import rewards_of_outcomes, rewards_of_staying
 
@@ -451,7 +454,7 @@ class Deep:
         """Train until the last of `points`, which comes after the last update, and call `at_point` at each.
 
         Algorithms that learn from whole rollouts, such as PPO, take the steps of their last rollout although fewer are
-        left; episodes that end after the last point are not counted.
+        left. Episodes that end after the last point are not counted.
         """
         model, last, waiting = self.model, points[-1], list(points)
         running, discount = np.zeros(self.env.num_envs), np.ones(self.env.num_envs)
@@ -496,7 +499,7 @@ class Deep:
             np.savez(folder / "replay.npz", **_buffer_arrays(buffer))  # type: ignore[arg-type]
 
     def load(self, folder: Path) -> None:
-        """Restore what `save` wrote; the episode that was running is started anew."""
+        """Restore what `save` wrote. The episode that was running is started anew."""
         import torch
 
         model = self.model

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from pharos.benchmark.comparison import LEAST, WORSE, compare_groups
+from pharos.benchmark.comparison import LEAST_DIFFERENCE, WORSE, compare_groups
 from pharos.benchmark.contents import Contents, Source, contents_of, listed, run_warnings
 from pharos.benchmark.diagnosis import ONE_ACTION, groups_of, nearest, policies_of, seeds_sentence
 from pharos.benchmark.doctor import on_policy, readings
-from pharos.benchmark.examination import NAMES, PROTOCOL, Examination, examine
+from pharos.benchmark.examination import EXAMINATION_PROTOCOL, NAMES, Examination, examine
 from pharos.benchmark.faults import FAMILIES, FAULTS, HEALTHY
 from pharos.benchmark.profiles import (
     BROKEN,
@@ -42,7 +42,7 @@ EXPLORER = (
 )
 LOSS = 0.1  # of score, on a group of tasks or an axis, that is a symptom
 IN_PLAY = 0.05  # of score, that is lost by chance in play
-SIGNS: Mapping[str, tuple[str, tuple[str, ...]]] = {
+LOSS_SIGNS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "vector": (
         "look for a number that never reaches the network (slices, the number of inputs), and at sizes of numbers",
         ("last_feature_lost",),
@@ -74,13 +74,13 @@ class Diagnosis:
         agent: its label. kind: "dqn", "ppo", or empty if it offers no values.
         verdict: one sentence.
         findings: symptoms that are there, signs of the likeliest fault first, then the strongest.
-        likeness: probability of each known fault, "none" among them, the largest first; empty for a finished run.
-        fault: the known fault that is said; None: none of the known ones.
+        likeness: probability of each known fault, "none" among them, the largest first. Empty for a finished run.
+        fault: the known fault that is said, or None for none of the known ones.
         strange: whether it is farther from all known faults, and from health, than known ones are.
         accuracy: how often the likeness was right for agents that the library did not have.
         scores: by world, or by task of a finished run: 1 optimal and 0 as uniform play, mean of the seeds.
-        readings: all numbers, see `doctor.readings`; empty for a finished run.
-        on_policy: whether its values are those of the policy that explores, as of SARSA; then `readings` are by what
+        readings: all numbers, see `doctor.readings`. Empty for a finished run.
+        on_policy: whether its values are those of the policy that explores, as of SARSA. If so, `readings` are by what
             was played, not by the largest next value. It is no fault of a learner on-policy.
     """
 
@@ -125,7 +125,7 @@ class Diagnosis:
         return library_of(self.kind)
 
     def nearest(self) -> list[tuple[str, float, str]]:
-        """The three likeliest faults: name, "healthy" for none; likeness; in words."""
+        """The three likeliest faults: (name, or "healthy" for none, likeness, in words)."""
         words = meanings(self.kind)
         three = list(self.likeness.items())[:3]
         return [("healthy" if name == HEALTHY else name, share, words.get(name, "")) for name, share in three]
@@ -141,7 +141,7 @@ class Diagnosis:
         }
 
     def to_html(self) -> str:
-        """The page as HTML, with a plot beside the nearest known agents; it loads and runs nothing."""
+        """The page as HTML, with a plot beside the nearest known agents. It loads and runs nothing."""
         from pharos.benchmark.diagnosis_page import diagnosis_page
 
         return diagnosis_page(self)
@@ -163,7 +163,7 @@ class Diagnosis:
 
 
 def meanings(kind: str) -> dict[str, str]:
-    """Faults in words; of all kinds if it is empty."""
+    """Faults in words, of all kinds if it is empty."""
     return {name: text for agent, table in FAULTS.items() if kind in ("", agent) for name, text in table.items()}
 
 
@@ -179,7 +179,7 @@ def diagnose(
     hyperparameters: Mapping[str, Any] | None = None,
     worlds: Sequence[str] = NAMES,
     seeds: Sequence[int] = (0, 1),
-    steps: int = PROTOCOL.steps,
+    steps: int = EXAMINATION_PROTOCOL.steps,
     timeout: float | None = None,
     suite: Suite | str | None = None,
     progress: Callable[[float, str], object] = lambda share, text: None,
@@ -195,9 +195,9 @@ def diagnose(
         results: in place of an agent: the folder or file of a finished run of a benchmark, or results read.
         suite: the suite of `results`, if it is not shipped.
     Raises:
-        ParameterError: it is no agent, or it yields no policy; there are no such results; or both are given.
+        ParameterError: it is no agent, or it yields no policy, there are no such results, or both are given.
         PharosError: its code raises something, SystemExit included. TimeLimit: a run took longer than was allowed.
-    Cost: 24 runs of 4,000 steps, in this process; of results, less than a second.
+    Cost: 24 runs of 4,000 steps, in this process. Of results: less than a second.
     """
     if (agent is None) == (results is None):
         raise ParameterError(f"agent {agent!r}, results {results!r}; expected one of both")
@@ -287,7 +287,8 @@ def diagnosis_of_results(contents: Contents) -> Diagnosis:
 
 
 def findings_of(contents: Contents) -> list[Finding]:
-    """Symptoms that a finished run shows beside the baseline that it is nearest to; without one, those of its own."""
+    """Symptoms that a finished run shows beside the baseline that it is nearest to. Without one, symptoms of its
+    own."""
     findings = _own_findings(contents)
     if (near := nearest(contents)) is None:
         return findings
@@ -302,7 +303,7 @@ def findings_of(contents: Contents) -> list[Finding]:
         )
         share = len(below) / len(contents.agent.score.tasks)
         findings.append(Finding("below_random", share, 0.25, wrong, advice, 10 * share, ("action_off_by_one",)))
-    axes = {axis: own.score for axis, own in comparison.axes.items() if axis in SIGNS}
+    axes = {axis: own.score for axis, own in comparison.axes.items() if axis in LOSS_SIGNS}
     is_worse = [own.verdict == WORSE and own.interval.value <= -LOSS for own in axes.values()]
     if comparison.core is not None and comparison.core.verdict == WORSE and len(axes) > 1 and all(is_worse):
         wrong = f"it falls everywhere: the core and the axes of {listed([*axes])} are below {other.name}'s"
@@ -314,7 +315,7 @@ def findings_of(contents: Contents) -> list[Finding]:
     for name, each in compare_groups(contents.agent.results, other.results, groups).items():
         rest = compare_groups(contents.agent.results, other.results, {"": sorted(core - {*groups[name]})})
         spared = rest[""].interval.value if rest else 0.0
-        if name in SIGNS and each.verdict == WORSE and spared > each.interval.value / 2:
+        if name in LOSS_SIGNS and each.verdict == WORSE and spared > each.interval.value / 2:
             where = f"core tasks with {name}" if name in by_property else f"core tasks seen as {name}"
             findings += _loss(name, each.interval.value, f"{where}, beside {spared:+.2f} on the others", other.name)
     for axis, own in axes.items():
@@ -326,7 +327,7 @@ def findings_of(contents: Contents) -> list[Finding]:
 def _loss(name: str, difference: float, where: str, other: str) -> list[Finding]:
     if difference > -LOSS:
         return []
-    advice, faults = SIGNS[name]
+    advice, faults = LOSS_SIGNS[name]
     wrong = f"it scores {-difference:.2f} less than {other} on {where}"
     return [Finding(name, difference, -LOSS, wrong, advice, -difference / LOSS, faults)]
 
@@ -345,5 +346,5 @@ def _own_findings(contents: Contents) -> list[Finding]:
     if noise and (loss := sum(noise) / len(facts)) > IN_PLAY:
         wrong = f"played greedily, the same policies score {loss:.2f} more on {listed([pluralize(len(facts), 'task')])}"
         advice = "judge the greedy policy of a learner of values; look at the temperature and the entropy bonus"
-        findings.append(Finding("noise", loss, IN_PLAY, wrong, advice, loss / LEAST, ("plays_at_random",)))
+        findings.append(Finding("noise", loss, IN_PLAY, wrong, advice, loss / LEAST_DIFFERENCE, ("plays_at_random",)))
     return findings

@@ -2,11 +2,11 @@
 
     engine       q_learning, dqn, ppo (the batched engine), a2c: pharos trains them, with one setting for all tasks
     class        module:Class or file.py:Class, with Stable-Baselines3's interface
-    generator    file.py:learn or a function: learn(env, steps, seed), see budget.py; its policies may have a memory
+    generator    file.py:learn or a function: learn(env, steps, seed), see budget.py. Its policies may have a memory
     jax          the same with learn(env, params, steps, key) -> (apply, snapshots), see training/functions.py
     exact        oracle and random: the optimal policy and uniform play, solved and not run
 
-`agent_form` chooses; a further form is a subclass of `Form`, and a line there.
+`agent_form` chooses. A further form is a subclass of `Form`, and a line there.
 """
 
 import contextlib
@@ -44,6 +44,7 @@ from pharos.system.sources import Source, find_source, is_reference, load_source
 from pharos.system.wording import capped, in_one_line, line_in
 from pharos.system.workers import Terminated, Workers
 from pharos.training import (
+    MOST_ERROR_LETTERS,
     Curve,
     Execution,
     FailedRun,
@@ -75,7 +76,6 @@ EXACT = ("oracle", "random")
 WARM = ("torch", "stable_baselines3")
 """Libraries that take long to load: the process that runs are forked from has them if the agent has."""
 LINGER_SECONDS = 10.0  # that a process may take to end when its run has
-LONGEST = 500  # letters of an agent's error
 
 OnProgress = Callable[[float, str], None]
 """on_progress(share of the steps that are done, text)."""
@@ -91,7 +91,7 @@ class RunSettings:
         workers: processes at once.
         checkpoints: folder of checkpoints of the batched engine.
         on_progress: called with the progress.
-        timeout: seconds after which a run that has its process is ended; None: never.
+        timeout: seconds after which a run that has its process is ended, or None for never.
     """
 
     workers: int
@@ -102,7 +102,7 @@ class RunSettings:
 
 @dataclass(frozen=True)
 class Job:
-    """One run: an agent on a task, with a seed; its files go into a folder."""
+    """One run: an agent on a task, with a seed. Its files go into a folder."""
 
     task: BenchmarkTask
     seed: int
@@ -122,7 +122,7 @@ class RunResult:
         curve: (evaluations,) normalised regret. exact: whether all of it is.
         steps: of the environment, as it counted them, else of the protocol.
         notes: sentences on what looks like a mistake, by kind.
-        policies: facts on the policies, by `policy_facts` of training/curve.py; empty if they are unknown.
+        policies: facts on the policies, by `policy_facts` of training/curve.py, or empty if they are unknown.
     """
 
     curve: np.ndarray
@@ -134,13 +134,13 @@ class RunResult:
 
 @dataclass(frozen=True)
 class Form:
-    """An agent and the way to train it; base class of the forms.
+    """An agent and the way to train it: the base class of the forms.
 
     Attributes:
         label: of the agent, for tables. kind: of form, as in the table above.
-        hyperparameters: all that are known; one setting for all tasks.
+        hyperparameters: all that are known, one setting for all tasks.
         source: origin of the user's own code.
-        checksum: SHA-256 of that file, or of the text of a function that is in none; empty if pharos has the code.
+        checksum: SHA-256 of that file, or of the text of a function that is in none. Empty if pharos has the code.
         errors: of runs that could not write their own, by folder.
     """
 
@@ -164,7 +164,7 @@ class Form:
         """The result of a finished run.
 
         Raises:
-            PharosError: the run has not finished; why not. ResultCorrupted: a file of it was changed since.
+            PharosError: the run has not finished, and why not. ResultCorrupted: a file of it was changed since.
         """
         record = read_record(job.folder) if (job.folder / "run.json").exists() else {}
         if record.get("status") != "finished":
@@ -184,7 +184,7 @@ class Form:
 
 
 def agent_form(agent: str | Callable[..., Any], suite: Suite, hyperparameters: Mapping[str, Any] | None = None) -> Form:
-    """The form of an agent; its code is imported.
+    """The form of an agent, whose code is imported.
 
     Args:
         agent: a name, `module:Name`, `file.py:Name`, or a generator function.
@@ -217,7 +217,7 @@ def agent_form(agent: str | Callable[..., Any], suite: Suite, hyperparameters: M
 
 
 def sha256(file: str | os.PathLike) -> str:
-    """SHA-256 of a file; empty if there is none."""
+    """SHA-256 of a file, or empty if there is none."""
     return hashlib.sha256(Path(file).read_bytes()).hexdigest() if Path(file).is_file() else ""
 
 
@@ -246,7 +246,7 @@ class TrainedForm(Form):
             Apart(self, [[job] for job in alone], _train_alone, arguments, fail, settings).execute()
 
     def _train_batched(self, jobs: Sequence[Job], configs: Sequence[RunConfig], settings: RunSettings) -> None:
-        """Train runs of the batched engine and tables, by lanes; they are of pharos' own code."""
+        """Train runs of the batched engine and tables, by lanes. They are of pharos' own code."""
         folders, seconds = [job.folder for job in jobs], [job.task.seconds.get(self.label, 1.0) for job in jobs]
 
         def progress(now: TrainingProgress) -> None:
@@ -326,7 +326,7 @@ class FunctionForm(Form):
     program has a process of its own, one after another: it uses all processors, or most of a GPU's memory.
 
     Attributes:
-        learn: the function; sent by value if it has no source.
+        learn: the function. It is sent by value if it has no source.
     """
 
     learn: Learn | LearnCompiled | None = None
@@ -500,9 +500,11 @@ def record_run(
 
 def failure(label: str, job: Job, end: BaseException | str, file: str | None = None) -> str:
     """The message of a run that has failed: its agent, task and seed, the error, and the line of the agent's file."""
-    text, place = (end, "") if isinstance(end, str) else (in_one_line(end), line_in(end, file))
-    printable = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in capped(text, LONGEST))
-    return f"{label} on {job.id}: {printable.rstrip(': ')}{place}"
+    text, line = (end, "") if isinstance(end, str) else (in_one_line(end), line_in(end, file))
+    printable = "".join(
+        letter if letter.isprintable() else ascii(letter)[1:-1] for letter in capped(text, MOST_ERROR_LETTERS)
+    )
+    return f"{label} on {job.id}: {printable.rstrip(': ')}{line}"
 
 
 # Processes ------------------------------------------------------------------------------------------------------------
@@ -516,8 +518,8 @@ class Apart(Execution[Job]):
     its own runs, whose run.json says why. Processes that an agent leaves behind end with its run.
 
     Args:
-        form: whose jobs they are; it keeps errors of runs that could not write their own.
-        groups: of jobs; finished jobs of a group run again if one of it is not finished.
+        form: the form of the jobs. It keeps errors of runs that could not write their own.
+        groups: of jobs. Finished jobs of a group run again if one of the group is not finished.
         body: function(*arguments[folder of the first job], jobs, send), which writes the folders of all runs and sends
             for each (its folder, None, an error message, or the OSError of writing).
         fail: fail(job, reason) writes the folder of a run whose process could not.

@@ -1,4 +1,4 @@
-"""Charts of the report as SVG inside its page: a few shapes, no library; texts are escaped by the tree that holds them.
+"""Charts of the report as SVG inside its page: a few shapes, no library. Texts are escaped by the tree that holds them.
 
 Colours and text are classes of the page's style (`STYLE`), so that charts follow light and dark pages. Agent k has the
 colour, the dash and the marker of its place, so that no line is told by its colour alone.
@@ -11,7 +11,7 @@ import numpy as np
 
 from pharos.benchmark.scores import ConfidenceInterval
 
-POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
+CONTENT_SECURITY_POLICY = "default-src 'none'; style-src 'unsafe-inline'; base-uri 'none'; form-action 'none'"
 WIDTH = 340
 MARKERS = ("M-4 0a4 4 0 1 0 8 0a4 4 0 1 0 -8 0z", "M-4 -4h8v8h-8z", "M0 -5l5 9h-10z", "M0 -5.5l5 5.5l-5 5.5l-5 -5.5z")
 CIVIDIS = ((0, 34, 78), (60, 78, 109), (124, 123, 120), (187, 174, 107), (254, 232, 56))  # Nunez et al. (2018)
@@ -89,7 +89,7 @@ def document(title: str, lead: Sequence[Element], sections: Sequence[Element]) -
     meta = (
         {"charset": "utf-8"},
         {"name": "viewport", "content": "width=device-width, initial-scale=1"},
-        {"http_equiv": "Content-Security-Policy", "content": POLICY},
+        {"http_equiv": "Content-Security-Policy", "content": CONTENT_SECURITY_POLICY},
     )
     head = element(
         "head", *(element("meta", **each) for each in meta), element("title", title), element("style", STYLE)
@@ -117,7 +117,7 @@ def bullets(texts: Sequence[str]) -> Element:
 
 
 def html_table(heads: Sequence[str], rows: Sequence[Sequence[Child]], numeric: Sequence[int] = ()) -> Element:
-    """A table that scrolls if it is wide; numbers to the right in the columns `numeric`."""
+    """A table that scrolls if it is wide. Numbers of the columns `numeric` stand at the right."""
 
     def kind(k: int, cell: Child) -> str:
         return "n" if k in numeric else "bar" if not isinstance(cell, str) and cell.tag == "svg" else ""
@@ -132,7 +132,7 @@ def _text(value: object) -> str:
 
 
 def drawing(width: int, height: int, title: str, *shapes: Element) -> Element:
-    """An SVG with a title for screen readers; without a title it is hidden from them, as nearby text says the same."""
+    """An SVG with a title for screen readers. Without a title it is hidden from them, as nearby text says the same."""
     name = {"role": "img", "aria_label": title} if title else {"aria_hidden": "true"}
     return element("svg", *shapes, viewBox=f"0 0 {width} {height}", **name)
 
@@ -155,8 +155,8 @@ def path(points: Sequence[tuple[float, float]]) -> str:
 def marker(x: float, y: float, agent: int, title: str = "") -> Element:
     """The marker of an agent, with a tooltip."""
     tip = [element("title", title)] if title else []
-    shape, place = MARKERS[agent % len(MARKERS)], f"translate({x:.1f} {y:.1f})"
-    return element("path", *tip, d=shape, class_=f"f{agent % 6}", transform=place)
+    shape, transform = MARKERS[agent % len(MARKERS)], f"translate({x:.1f} {y:.1f})"
+    return element("path", *tip, d=shape, class_=f"f{agent % 6}", transform=transform)
 
 
 def label(x: float, y: float, text: str, anchor: str = "start", class_: str = "") -> Element:
@@ -165,7 +165,7 @@ def label(x: float, y: float, text: str, anchor: str = "start", class_: str = ""
 
 
 def legend(names: Sequence[str], theory: str | None = None) -> Element:
-    """A list of agents with the marks of each; `theory` names the dashed line."""
+    """A list of agents with the marks of each. `theory` names the dashed line."""
     marks = [
         (name, drawing(34, 12, "", line(1, 6, 33, 6, f"l{k % 6}"), marker(17, 6, k))) for k, name in enumerate(names)
     ]
@@ -193,7 +193,7 @@ def bars(rows: Mapping[int, tuple[str, ConfidenceInterval]], title: str) -> Elem
 
 
 def radar(axes: Sequence[str], scores: Sequence[Mapping[str, float]], title: str) -> Element:
-    """Scores in [0, 1] along rays, one for each axis; an outline for each agent."""
+    """Scores in [0, 1] along rays, one for each axis, with an outline for each agent."""
     size, middle, radius = 360, 180, 120
     angles = 2 * np.pi * np.arange(len(axes)) / len(axes) - np.pi / 2
     rays = np.column_stack([np.cos(angles), np.sin(angles)])
@@ -221,7 +221,7 @@ def ladder_panel(
     """Normalised regret along the rungs of a ladder: the first line with whiskers and its frontier.
 
     Args:
-        levels: of the rungs, which stand equally far apart; between them the frontier is interpolated.
+        levels: of the rungs, which stand equally far apart. Between them the frontier is interpolated.
         lines: for each agent its normalised regret on each rung, None if it did not run.
         theory: of the idealised learner, None if it was not predicted.
         frontier: of the first agent, in units of `levels`.
@@ -231,8 +231,8 @@ def ladder_panel(
     height = (bottom - top) / 1.05
 
     def across(level: float) -> float:
-        place = np.interp(level, levels, np.arange(len(levels))) / max(1, len(levels) - 1)
-        return float(left + 10 + (right - left - 20) * place)
+        share = np.interp(level, levels, np.arange(len(levels))) / max(1, len(levels) - 1)
+        return float(left + 10 + (right - left - 20) * share)
 
     def down(regret: float) -> float:
         return bottom - height * min(max(regret, 0.0), 1.05)
@@ -277,7 +277,8 @@ def learning_panel(steps: int, lines: Sequence[Sequence[ConfidenceInterval]], ti
     """Normalised regret at evaluations, equally far apart up to `steps`: a line for each agent, the first with a band.
 
     Args:
-        lines: for each agent its regret at each evaluation; empty: it has none, and keeps its colour.
+        lines: for each agent its regret at each evaluation. An agent without any has an empty one, and keeps its
+            colour.
     """
     left, right, top, bottom = 54, 540, 12, 220
     shapes = regret_axis(left, right, top, bottom)
@@ -289,7 +290,7 @@ def learning_panel(steps: int, lines: Sequence[Sequence[ConfidenceInterval]], ti
         shapes.append(label(at(k / 3, 0)[0], bottom + 15, f"{steps * k / 3:,.0f}", "middle", "faint"))
     shapes.append(label((left + right) / 2, bottom + 32, "steps", "middle"))
     for k, own in reversed([(k, own) for k, own in enumerate(lines) if own]):
-        shares = [place / len(own) for place in range(1, len(own) + 1)]
+        shares = [rank / len(own) for rank in range(1, len(own) + 1)]
         if not k:
             low, high = ([at(x, ends(each)[end]) for x, each in zip(shares, own, strict=True)] for end in (0, 1))
             shapes.append(element("path", d=path([*low, *reversed(high)]) + "Z", class_="f0", opacity="0.16"))
@@ -348,8 +349,8 @@ def scatter(
 
 def shade(share: float) -> str:
     """Colour of a number in [0, 1] in the scale cividis, readable with colour vision deficiencies."""
-    place = np.linspace(0, 1, len(CIVIDIS))
-    red, green, blue = (round(float(np.interp(share, place, [color[k] for color in CIVIDIS]))) for k in range(3))
+    shares = np.linspace(0, 1, len(CIVIDIS))
+    red, green, blue = (round(float(np.interp(share, shares, [color[k] for color in CIVIDIS]))) for k in range(3))
     return f"#{red:02x}{green:02x}{blue:02x}"
 
 

@@ -10,7 +10,7 @@ from pharos.benchmark.execution import Outcome, run
 from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite, digest_of_suite, frozen
 from pharos.errors import AllRunsFailed, ParameterError
 
-PROTOCOL = Protocol(steps=6000, evaluations=3, seeds=2)
+CHECK_PROTOCOL = Protocol(steps=6000, evaluations=3, seeds=2)
 TASKS = (
     BenchmarkTask("vectors", "frozen_lake", {"size": 4}, "vector", chance={"random": 0.1}),
     BenchmarkTask("images", "deep_sea", {"size": 4, "mapping_seed": 1}, "simple_image"),
@@ -62,10 +62,10 @@ def check_agent(
         agent, hyperparameters, workers: as `benchmark.run` takes them.
         timeout: seconds after which a run is ended.
     Returns:
-        An AgentCheck, which is true if there was no error; print it.
+        An AgentCheck, which is true if there was no error. Print it.
     """
     label = agent if isinstance(agent, str) else getattr(agent, "__qualname__", repr(agent))
-    suite = Suite("check", PROTOCOL, tuple(frozen(task, PROTOCOL) for task in TASKS), ())
+    suite = Suite("check", CHECK_PROTOCOL, tuple(frozen(task, CHECK_PROTOCOL) for task in TASKS), ())
     suite = replace(suite, digest=digest_of_suite(suite))
     options: dict[str, Any] = {"hyperparameters": hyperparameters, "timeout": timeout, "workers": workers}
     with tempfile.TemporaryDirectory() as folder:

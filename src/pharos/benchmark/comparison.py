@@ -1,11 +1,11 @@
 """Comparisons of two agents on a suite, and how many seeds a difference needs.
 
 All differences are of the first agent less the second. A p-value belongs to Welch's t over seeds within tasks, as the
-interval does: the interval excludes 0 if p < 0.05. Holm's correction covers the axes, and for themselves
-the tasks; the core is one question and stands alone.
+interval does: the interval excludes 0 if p < 0.05. Holm's correction covers the axes, and for themselves the tasks. The
+core is one question and stands alone.
 
 Source: Newcombe (1998), Interval estimation for the difference between independent proportions, for differences of
-frontiers; of the others see `pharos.statistics`.
+frontiers. For the others see `pharos.statistics`.
 """
 
 import math
@@ -43,9 +43,9 @@ SIGNIFICANCE = 1.0 - CONFIDENCE
 POWER = 0.8
 SEEDS = (3, 5, 10, 20)
 MOST_SEEDS = 100_000
-LEAST = 0.02  # a difference of scores that matters
-BETTER, WORSE, UNDECIDED, UNKNOWN = "better", "worse", "not shown to differ", "one seed"
-NEGLIGIBLE = f"less than {LEAST:g} apart"
+LEAST_DIFFERENCE = 0.02  # a difference of scores that matters
+BETTER, WORSE, NOT_SHOWN_TO_DIFFER, ONE_SEED = "better", "worse", "not shown to differ", "one seed"
+NEGLIGIBLE = f"less than {LEAST_DIFFERENCE:g} apart"
 EQUAL_SEEDS = "equal seeds"
 
 
@@ -55,12 +55,12 @@ class Difference:
 
     Attributes:
         ours, theirs: the scores, in [0, 1].
-        interval: first agent less second, with its 95 % interval; NaN ends if one of them has one seed.
+        interval: first agent less second, with its 95 % interval. Its ends are NaN if one of them has one seed.
         improvement: how probable it is that a run of the first scores higher, ties half, mean over the tasks.
-        p_value: two-sided; NaN with one seed.
+        p_value: two-sided, or NaN with one seed.
         adjusted: the same after Holm's correction in its family.
         verdict: "better" or "worse" if adjusted < 0.05 and the scores are 0.02 apart or more; "less than 0.02 apart"
-            if they are not; otherwise "not shown to differ". Without a p-value "one seed", or "equal seeds" if the
+            if they are not. Otherwise "not shown to differ". Without a p-value "one seed", or "equal seeds" if the
             seeds of one agent are one run.
     """
 
@@ -95,7 +95,7 @@ class Comparison:
 
     Attributes:
         ours, theirs: labels. core: None if no core task is common to both.
-        axes: by axis; tasks: by name.
+        axes: by axis. tasks: by name.
         left_out: tasks of the suite that one of them lacks, which nothing here contains.
     """
 
@@ -114,7 +114,7 @@ class Power:
     Attributes:
         standard_error: over the seeds that there are.
         least_differences: number of seeds -> least difference that is found with power 0.8.
-        seeds_needed: of each agent, for the difference that was asked for; None if none was, or beyond 100,000.
+        seeds_needed: of each agent, for the difference that was asked for. None if none was, or beyond 100,000.
     """
 
     standard_error: float
@@ -139,7 +139,7 @@ def compare(
     for each in (ours, theirs):
         check_suite(each, suite)
     # Scores of the tasks that both have run
-    unknown = EQUAL_SEEDS if has_equal_seeds(ours) or has_equal_seeds(theirs) else UNKNOWN
+    unknown = EQUAL_SEEDS if has_equal_seeds(ours) or has_equal_seeds(theirs) else ONE_SEED
     x, y = run_scores(as_one_run(ours)), run_scores(as_one_run(theirs))
     common = [task.name for task in suite.tasks if task.name in x and task.name in y]
     if not common:
@@ -178,9 +178,9 @@ def compare_groups(
 
     Args:
         ours, theirs: results on one suite.
-        groups: name -> names of tasks; tasks that one of them lacks are left out, and so are groups without a task.
+        groups: name -> names of tasks. Tasks that one of them lacks are left out, and so are groups without a task.
     """
-    unknown = EQUAL_SEEDS if has_equal_seeds(ours) or has_equal_seeds(theirs) else UNKNOWN
+    unknown = EQUAL_SEEDS if has_equal_seeds(ours) or has_equal_seeds(theirs) else ONE_SEED
     x, y = run_scores(as_one_run(ours)), run_scores(as_one_run(theirs))
     common = {group: [name for name in names if name in x and name in y] for group, names in groups.items()}
     return _judged({group: _difference(x, y, names) for group, names in common.items() if names}, unknown)
@@ -197,7 +197,7 @@ def power(
         results, suite: as for `compare`.
         difference: of scores, to be found with power 0.8.
     Raises:
-        ParameterError: fewer than two seeds, or seeds that are one run; a difference that is not positive, or another
+        ParameterError: fewer than two seeds, seeds that are one run, a difference that is not positive, or another
             suite.
     """
     results = results_of(results)
@@ -266,7 +266,7 @@ def _difference(
     names: Sequence[str],
     pair_weights: Mapping[str, float] | None = None,
 ) -> Difference:
-    """Difference of mean scores; with weights of pairs that of 1 less what is lost by the second tasks.
+    """Difference of mean scores. With weights of pairs, the difference of 1 less what the second tasks lose.
 
     The improvement of pairs is that on their second tasks.
     """
@@ -292,12 +292,13 @@ def _difference(
         ),
         p_value=p_value,
         adjusted=p_value,
-        verdict=UNDECIDED,
+        verdict=NOT_SHOWN_TO_DIFFER,
     )
 
 
-def _judged(differences: Mapping[str, Difference], unknown: str = UNKNOWN) -> dict[str, Difference]:
-    """The differences of one family, with Holm's correction and verdicts; `unknown` is that without a p-value."""
+def _judged(differences: Mapping[str, Difference], unknown: str = ONE_SEED) -> dict[str, Difference]:
+    """The differences of one family, with Holm's correction and verdicts. `unknown` is the verdict without a
+    p-value."""
     adjusted = holm([each.p_value for each in differences.values()]).tolist()
     return {
         name: replace(each, adjusted=p, verdict=_verdict(each.interval.value, p, unknown))
@@ -307,8 +308,8 @@ def _judged(differences: Mapping[str, Difference], unknown: str = UNKNOWN) -> di
 
 def _verdict(difference: float, p_value: float, unknown: str) -> str:
     if not p_value < SIGNIFICANCE:
-        return unknown if math.isnan(p_value) else UNDECIDED
-    return NEGLIGIBLE if abs(difference) < LEAST else BETTER if difference > 0 else WORSE
+        return unknown if math.isnan(p_value) else NOT_SHOWN_TO_DIFFER
+    return NEGLIGIBLE if abs(difference) < LEAST_DIFFERENCE else BETTER if difference > 0 else WORSE
 
 
 def _seeds_for(variances: np.ndarray, difference: float) -> int | None:

@@ -15,14 +15,14 @@ from pharos.benchmark.charts import ends, frontier_text
 from pharos.benchmark.comparison import (
     BETTER,
     NEGLIGIBLE,
-    UNDECIDED,
+    NOT_SHOWN_TO_DIFFER,
     WORSE,
     Comparison,
     compare,
     results_of,
     suite_of_results,
 )
-from pharos.benchmark.results import FILE, AgentResults, baselines
+from pharos.benchmark.results import RESULTS_FILE, AgentResults, baselines
 from pharos.benchmark.scores import BenchmarkScore, ConfidenceInterval, as_one_run, run_regrets, run_scores, score
 from pharos.benchmark.suite import BenchmarkTask, Suite
 from pharos.errors import ParameterError
@@ -30,14 +30,14 @@ from pharos.plots import agent_label
 from pharos.system import storage
 from pharos.system.wording import pluralize
 
-BESIDE = ("dqn", "ppo", "q_learning")
+DEFAULT_BASELINES = ("dqn", "ppo", "q_learning")
 LEARNERS = ("dqn", "ppo")  # idealised, with networks
 RESIDUAL = 0.2
 NO_LADDERS = " The ladders were not run, so there are no frontiers."
-LATE = 0.2  # of an agent that learns late, by which the final score exceeds the mean one, with its whole interval
+LATE_GAIN = 0.2  # of an agent that learns late, by which the final score exceeds the mean one, with its whole interval
 ENDS_WORSE = 0.05  # the same of one that ends worse than it was, by which the final score is lower
-MOST = 5  # reasons of failures on the page
-LONGEST = 400  # letters of an entry of the record on the page
+MOST_REASONS = 5  # reasons of failures on the page
+MOST_RECORD_LETTERS = 400  # letters of an entry of the record on the page
 PHRASES = {
     "exploration": "explores to",
     "estimation": "stands noise of",
@@ -50,7 +50,7 @@ PHRASES = {
     "large_rewards": "stands rewards larger by",
     "small_rewards": "stands rewards smaller by",
 }
-PREDICTORS = {
+PREDICTOR_PHRASES = {
     "dqn": "the idealised DQN",
     "ppo": "the idealised PPO",
     "table": "the idealised DQN with a table",
@@ -76,7 +76,7 @@ class Contents:
     Attributes:
         suite: of the results. agent: the one that it is about. beside: baselines.
         comparisons: of the agent with each of `beside`.
-        predictor: "dqn", "ppo", "table" or "both" (the larger of dqn and ppo), by which residuals are taken; "none".
+        predictor: "dqn", "ppo", "table" or "both" (the larger of dqn and ppo), by which residuals are taken, or "none".
     """
 
     suite: Suite
@@ -91,7 +91,7 @@ class Contents:
         return [self.agent, *self.beside]
 
     def predicted(self, task: BenchmarkTask) -> float | None:
-        """Normalised regret of the idealised learner on a task; None without a prediction."""
+        """Normalised regret of the idealised learner on a task, or None without a prediction."""
         if self.predictor == "both":
             pair = [task.predicted[name] for name in LEARNERS if name in task.predicted]
             return max(pair) if len(pair) == 2 else None
@@ -109,13 +109,15 @@ def contents_of(
     predictor: str | None = None,
     suite: Suite | str | None = None,
 ) -> Contents:
-    """Contents of a report; arguments and errors as for `report`."""
+    """Contents of a report. Arguments and errors are the same as for `report`."""
     own = results_of(results)
     suite = suite_of_results(own, suite)
     if beside is None:
-        beside = [f"{suite.name}/{name}" for name in BESIDE if name in baselines(suite.name) and name != own.agent]
-    if predictor not in (None, "none", *PREDICTORS):
-        raise ParameterError(f"predictor {predictor}; expected one of {', '.join(PREDICTORS)}, none")
+        beside = [
+            f"{suite.name}/{name}" for name in DEFAULT_BASELINES if name in baselines(suite.name) and name != own.agent
+        ]
+    if predictor not in (None, "none", *PREDICTOR_PHRASES):
+        raise ParameterError(f"predictor {predictor}; expected one of {', '.join(PREDICTOR_PHRASES)}, none")
     others = [results_of(each) for each in beside]
     agents: list[ScoredAgent] = []
     for source, each in zip((results, *beside), (own, *others), strict=True):
@@ -127,7 +129,7 @@ def contents_of(
 
 
 def learner_kind(results: AgentResults) -> str:
-    """The idealised learner that an agent is a kind of, by its name and source; "both" if these do not tell."""
+    """The idealised learner that an agent is a kind of, by its name and source, or "both" if these do not decide it."""
     names = f"{results.agent} {results.record.get('source')}".lower()
     if "recurrent" in names:  # no idealised learner has a memory
         return "none"
@@ -144,12 +146,12 @@ def _names(source: Source, label: str, is_first: bool) -> Iterator[str]:
     yield name
     if not isinstance(source, AgentResults) and Path(source).exists():
         path = Path(source).resolve()
-        yield f"{name} ({path.parent.name if path.name == FILE else path.name.removesuffix('.safetensors')})"
+        yield f"{name} ({path.parent.name if path.name == RESULTS_FILE else path.name.removesuffix('.safetensors')})"
     yield from (f"{name} ({k})" for k in count(2))
 
 
 def regret_of(agent: ScoredAgent, task: BenchmarkTask) -> ConfidenceInterval | None:
-    """Normalised regret of an agent on a task, clipped to [0, 1]; None if it did not run."""
+    """Normalised regret of an agent on a task, clipped to [0, 1], or None if it did not run."""
     own = agent.score.tasks.get(task.name)
     return None if own is None else ConfidenceInterval(1 - own.value, 1 - own.high, 1 - own.low)
 
@@ -177,7 +179,7 @@ def _core_sentence(contents: Contents) -> str:
     """Sentence on the core alone: below or above which baselines by an interval, and on which tasks it is worst."""
     core, scores = contents.suite.core, contents.agent.score.tasks
     names = sorted((task.name for task in core if task.name in scores), key=lambda name: scores[name].value)
-    words = {WORSE: "below", BETTER: "above", UNDECIDED: "not shown to differ from", NEGLIGIBLE: "as good as"}
+    words = {WORSE: "below", BETTER: "above", NOT_SHOWN_TO_DIFFER: "not shown to differ from", NEGLIGIBLE: "as good as"}
     groups: dict[str, list[str]] = {word: [] for word in (*words.values(), "beside")}
     for other, comparison in zip(contents.beside, contents.comparisons, strict=True):
         if comparison.core is not None:
@@ -227,7 +229,7 @@ def final_regret(agent: ScoredAgent, task: BenchmarkTask) -> float:
 
 
 def learning_curve(agent: ScoredAgent, names: Sequence[str]) -> list[ConfidenceInterval]:
-    """Mean over tasks of normalised regret at each evaluation, each run's clipped to [0, 1]; empty if one was not run.
+    """Mean over tasks of normalised regret at each evaluation, each run's clipped to [0, 1]. Empty if one was not run.
 
     Args:
         names: of the tasks.
@@ -246,7 +248,9 @@ def learning_sentence(contents: Contents) -> str:
     names = [task.name for task in contents.suite.core if task.name in curves]
     runs, finals = run_scores(results), run_scores(results, last=True)
     gain = ConfidenceInterval.of_mean([finals[name] - runs[name] for name in names])
-    word = ": it learns late" if gain.low > LATE else ": it ends worse than it was" if gain.high < -ENDS_WORSE else ""
+    word = (
+        ": it learns late" if gain.low > LATE_GAIN else ": it ends worse than it was" if gain.high < -ENDS_WORSE else ""
+    )
     text = f"Ends at a score of {own.final.value:.2f}, averages {own.core.value:.2f}{word}."
     evaluations = curves[names[0]].shape[1]
     third = max(1, evaluations // 3)
@@ -278,13 +282,13 @@ def excerpt(value: object) -> str:
     if isinstance(value, Mapping):
         value = ", ".join(f"{name} {each}" for name, each in sorted(value.items()))
     text = value if isinstance(value, str) else json.dumps(storage.plain(value), sort_keys=True)
-    return text if len(text) <= LONGEST else text[:LONGEST] + "…"
+    return text if len(text) <= MOST_RECORD_LETTERS else text[:MOST_RECORD_LETTERS] + "…"
 
 
 def run_warnings(results: AgentResults) -> list[str]:
     """Sentences on runs that failed, and on what looks like a mistake of the agent, a reason or a kind each.
 
-    At most MOST of each, with the first run that it holds of.
+    At most MOST_REASONS of each, with the first run that it holds of.
     """
     sentences = []
     failed = results.record.get("failed")
@@ -292,13 +296,13 @@ def run_warnings(results: AgentResults) -> list[str]:
         reasons: dict[str, list[str]] = {}
         for which, reason in failed.items():
             reasons.setdefault(str(reason).partition(f"{which}: ")[2] or str(reason), []).append(which)
-        sentences = [f"Failed: {_first_of(runs)}: {reason}" for reason, runs in list(reasons.items())[:MOST]]
-        if len(reasons) > MOST:
+        sentences = [f"Failed: {_first_of(runs)}: {reason}" for reason, runs in list(reasons.items())[:MOST_REASONS]]
+        if len(reasons) > MOST_REASONS:
             sentences.append(
-                f"Failed: {pluralize(sum(map(len, list(reasons.values())[MOST:])), 'run')} for other reasons."
+                f"Failed: {pluralize(sum(map(len, list(reasons.values())[MOST_REASONS:])), 'run')} for other reasons."
             )
     notes = results.record.get("notes")
-    kinds = list(notes.values())[:MOST] if isinstance(notes, Mapping) else []
+    kinds = list(notes.values())[:MOST_REASONS] if isinstance(notes, Mapping) else []
     for runs in kinds:
         if isinstance(runs, Mapping) and runs:
             sentences.append(f"Note: {_first_of(list(runs))}: {next(iter(runs.values()))}.")

@@ -11,16 +11,16 @@ from dataclasses import replace
 from pharos.benchmark.charts import frontier_text
 from pharos.benchmark.comparison import (
     BETTER,
-    LEAST,
+    LEAST_DIFFERENCE,
     NEGLIGIBLE,
-    UNDECIDED,
+    NOT_SHOWN_TO_DIFFER,
     WORSE,
     AxisComparison,
     Comparison,
     Difference,
 )
 from pharos.benchmark.contents import (
-    PREDICTORS,
+    PREDICTOR_PHRASES,
     Contents,
     ScoredAgent,
     learner_kind,
@@ -37,16 +37,16 @@ from pharos.benchmark.suite import BenchmarkTask
 from pharos.system.wording import pluralize
 
 SHIPPED = {"dqn": ("dqn",), "ppo": ("ppo",), "table": ("q_learning",), "both": ("dqn", "ppo")}
-OWN = 0.1  # by which the regret of a residual is above the regret of the shipped agent of the kind
+OWN_RESIDUAL = 0.1  # by which the regret of a residual is above the regret of the shipped agent of the kind
 ONE_ACTION = 0.9  # share of states in which a policy prefers the same action, to be told so
-SHOWN = 5  # names of tasks in a sentence
-VERDICTS = (WORSE, BETTER, NEGLIGIBLE, UNDECIDED)
+SHOWN_TASKS = 5  # names of tasks in a sentence
+VERDICTS = (WORSE, BETTER, NEGLIGIBLE, NOT_SHOWN_TO_DIFFER)
 
 
 def nearest(contents: Contents) -> tuple[int, float, bool] | None:
     """Index of the baseline to compare the agent with, mean distance of their scores, whether of the same kind.
 
-    Among baselines of the agent's kind, else among all, the one with the nearest scores on core tasks; None without
+    Among baselines of the agent's kind, else among all, the one with the nearest scores on core tasks, or None without
     any.
     """
     names = {task.name for task in contents.suite.core}
@@ -59,12 +59,13 @@ def nearest(contents: Contents) -> tuple[int, float, bool] | None:
         return None
     kind = learner_kind(contents.agent.results)
     same = [k for k in distances if kind == learner_kind(contents.beside[k].results) and kind not in ("both", "none")]
-    place = min(same or distances, key=distances.__getitem__)
-    return place, distances[place], bool(same)
+    nearest = min(same or distances, key=distances.__getitem__)
+    return nearest, distances[nearest], bool(same)
 
 
 def strengths(contents: Contents) -> dict[str, list[str]]:
-    """Lines on the axes for each verdict of `compare` that occurs, in the order of VERDICTS; without it, none.
+    """Lines on the axes for each verdict of `compare` that occurs, in the order of VERDICTS. Without a comparison,
+    none.
 
     A line: the axis with the agent's frontier, then each baseline's frontier and the difference of scores.
     """
@@ -91,18 +92,19 @@ def without_verdict(contents: Contents) -> dict[str, list[str]]:
 
 
 def is_worse_everywhere(comparison: Comparison) -> bool:
-    """Whether the core and all ladders, two or more, are worse; pairs hold an agent against itself."""
+    """Whether the core and all ladders, two or more, are worse. Pairs compare an agent with itself, so they do not
+    count."""
     verdicts = [each.score.verdict for each in ladders_of(comparison).values()]
     return comparison.core is not None and len(verdicts) > 1 and {comparison.core.verdict, *verdicts} == {WORSE}
 
 
 def ladders_of(comparison: Comparison) -> dict[str, AxisComparison]:
-    """The axes that are ladders, on which more than one rung was run; no pairs."""
+    """The axes that are ladders, on which more than one rung was run, without pairs."""
     return {axis: each for axis, each in comparison.axes.items() if not math.isnan(each.frontiers[0].value)}
 
 
 def fall_everywhere(contents: Contents) -> str:
-    """A sentence if the core and all axes are worse than the nearest baseline's; else empty."""
+    """A sentence if the core and all axes are worse than the nearest baseline's, else empty."""
     if (near := nearest(contents)) is None or not is_worse_everywhere(contents.comparisons[near[0]]):
         return ""
     return (
@@ -112,7 +114,7 @@ def fall_everywhere(contents: Contents) -> str:
 
 
 def fails_on_the_lowest_rung(own: AxisScore) -> bool:
-    """Whether regret on the first rung is above 0.5 by its whole interval; not of memory, which that rung asks for."""
+    """Whether regret on the first rung is above 0.5 by its whole interval. Not for memory, which that rung asks for."""
     return own.axis != "memory" and not math.isnan(own.lowest.low) and own.lowest.high < CROSSING
 
 
@@ -153,7 +155,7 @@ def falls(contents: Contents) -> list[list[str]]:
     return rows
 
 
-def gaps(contents: Contents) -> list[list[str]]:
+def level_gaps(contents: Contents) -> list[list[str]]:
     """Rows on each pair of levels seen and held out that was run: both scores of the agent, and the gap of all agents.
 
     The gap is regret on held-out levels less that on training levels, by seed.
@@ -176,7 +178,7 @@ def gaps(contents: Contents) -> list[list[str]]:
 def groups_of(contents: Contents) -> tuple[dict[str, list[str]], dict[str, list[str]]]:
     """Names of core tasks by what is seen, and by property: reward sizes, length, ends, chance, number of actions.
 
-    Properties with one group say nothing, and are left out; so are tasks that `known_properties` lacks.
+    Properties with one group say nothing, and are left out. So are tasks that `known_properties` lacks.
     """
     by_observation: dict[str, list[str]] = {}
     kinds: list[dict[str, list[str]]] = []
@@ -185,9 +187,9 @@ def groups_of(contents: Contents) -> tuple[dict[str, list[str]], dict[str, list[
             continue
         by_observation.setdefault(task.observation, []).append(task.name)
         if (own := known_properties().get(task.digest)) is not None:
-            for place, group in enumerate(own.groups):
-                kinds += [{}] * (place == len(kinds))
-                kinds[place] = {**kinds[place], group: [*kinds[place].get(group, []), task.name]}
+            for index, group in enumerate(own.groups):
+                kinds += [{}] * (index == len(kinds))
+                kinds[index] = {**kinds[index], group: [*kinds[index].get(group, []), task.name]}
     return by_observation, {group: names for kind in kinds if len(kind) > 1 for group, names in sorted(kind.items())}
 
 
@@ -204,7 +206,8 @@ def worst_groups(groups: Mapping[str, Difference]) -> str:
 
 
 def shipped_regret(contents: Contents, task: BenchmarkTask) -> float | None:
-    """Normalised regret on a task of the shipped agent of the predictor's kind, the larger of two; None without one."""
+    """Normalised regret on a task of the shipped agent of the predictor's kind, the larger of two, or None without
+    one."""
     regrets = []
     for name in SHIPPED.get(contents.predictor, ()):
         beside = [each.results for each in contents.beside if each.results.agent == name]
@@ -218,17 +221,17 @@ def shipped_regret(contents: Contents, task: BenchmarkTask) -> float | None:
 def is_own(contents: Contents, task: BenchmarkTask, regret: float) -> bool:
     """Whether a residual is the agent's own: it is more than 0.1 worse than the shipped agent, or there is none."""
     shipped = shipped_regret(contents, task)
-    return shipped is None or regret - shipped > OWN
+    return shipped is None or regret - shipped > OWN_RESIDUAL
 
 
 def predictor_sentence(contents: Contents) -> str:
     """Sentence on which idealised learner was taken, and the number of tasks that the others would list."""
     counts = {
         name: len(residual_tasks(replace(contents, predictor=name)))
-        for name in PREDICTORS
+        for name in PREDICTOR_PHRASES
         if name != contents.predictor
     }
-    others = listed([f"{count} beside {PREDICTORS[name]}" for name, count in counts.items()])
+    others = listed([f"{count} beside {PREDICTOR_PHRASES[name]}" for name, count in counts.items()])
     request = (
         "The agent's name does not say its kind, so the worse of two was taken, which lists the fewest; say it: "
         "--predictor dqn, ppo, table or none. "
@@ -266,9 +269,13 @@ def policies_of(results: AgentResults) -> dict[str, Mapping[str, float]]:
         for name, facts in entries
         if name in results.curves
         and isinstance(facts, Mapping)
-        and all(isinstance(facts.get(each), int | float) for each in ("one_action", "deterministic"))
-        and isinstance(facts.get("greedy_score", 0.0), int | float)
+        and all(_is_share(facts.get(each)) for each in ("one_action", "deterministic"))
+        and _is_share(facts.get("greedy_score", 0.0))
     }
+
+
+def _is_share(value: object) -> bool:
+    return isinstance(value, int | float) and 0 <= value <= 1
 
 
 def policy_sentences(contents: Contents) -> list[str]:
@@ -280,7 +287,8 @@ def policy_sentences(contents: Contents) -> list[str]:
     count, sentences = pluralize(len(facts), "core task"), []
     fixed = [name for name, each in facts.items() if each["one_action"] >= ONE_ACTION]
     if fixed:
-        shown = f"{', '.join(fixed[:SHOWN])}{f' and {len(fixed) - SHOWN} more' if len(fixed) > SHOWN else ''}"
+        more = f" and {len(fixed) - SHOWN_TASKS} more" if len(fixed) > SHOWN_TASKS else ""
+        shown = f"{', '.join(fixed[:SHOWN_TASKS])}{more}"
         sentences.append(
             f"One action in {100 * ONE_ACTION:.0f} % of states and more: on {len(fixed)} of {count} the final policy "
             f"prefers the same action nearly everywhere ({shown}). If the observation does not reach the policy, or "
@@ -296,9 +304,9 @@ def policy_sentences(contents: Contents) -> list[str]:
         best = sum(facts[name].get("greedy_score", float(runs[name].mean())) for name in facts) / len(facts)
         noise = (
             f"of {1 - own:.2f} below optimal, {best - own:.2f} is noise in play"
-            if best - own >= LEAST
+            if best - own >= LEAST_DIFFERENCE
             else "noise in play costs nothing"
-            if best - own > -LEAST
+            if best - own > -LEAST_DIFFERENCE
             else f"it plays {own - best:.2f} better with its chance"
         )
         sentences.append(

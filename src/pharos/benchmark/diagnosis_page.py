@@ -23,12 +23,12 @@ from pharos.benchmark.faults import HEALTHY
 from pharos.benchmark.profiles import Profile, deviations
 from pharos.benchmark.scores import ConfidenceInterval
 
-ROWS = 12  # readings in the plot
+MOST_READINGS = 12  # readings in the plot
 WIDEST = 8.0  # deviations
 
 
 def diagnosis_page(diagnosis: Diagnosis) -> str:
-    """The HTML page of a diagnosis; every text passes through the tree, which escapes it."""
+    """The HTML page of a diagnosis. Every text passes through the tree, which escapes it."""
     lead = [element("p", diagnosis.verdict, class_="lead")]
     parts = [_findings(diagnosis), _likeness(diagnosis), _profile(diagnosis), _scores(diagnosis)]
     return document(f"Diagnosis of {diagnosis.agent}", lead, [part for part in parts if part is not None])
@@ -69,14 +69,14 @@ def _profile(diagnosis: Diagnosis) -> Element | None:
 def profile_rows(
     numbers: Mapping[str, float], library: list[Profile], faults: list[str]
 ) -> tuple[list[str], list[tuple[float, ...]]]:
-    """Names of the readings in which an agent, or one of some faults, differs most from healthy ones; and how much.
+    """Names of the readings in which an agent, or one of some faults, differs most from healthy ones, and how much.
 
     Each row: the agent, then the faults, in deviations from the mean of healthy ones.
     """
     away = deviations(numbers, library)
     own = away.rows[away.faults.index(HEALTHY)]
     columns = np.array([own, *(own - away.rows[away.faults.index(fault)] for fault in faults)])
-    order = np.argsort(-np.abs(np.clip(columns, -WIDEST, WIDEST)).sum(axis=0), kind="stable")[:ROWS]
+    order = np.argsort(-np.abs(np.clip(columns, -WIDEST, WIDEST)).sum(axis=0), kind="stable")[:MOST_READINGS]
     return [away.names[k] for k in order], [tuple(map(float, columns[:, k])) for k in order]
 
 

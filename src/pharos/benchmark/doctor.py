@@ -9,7 +9,7 @@ arrays.
 A learner of the values of the policy that explores, such as SARSA, obeys Q(s, a) = r(s, a) + gamma E sum mu(a'|s')
 Q(s', a') in place of it, with mu as it was played. `on_policy` has the same readings for it.
 
-Source: Sutton and Barto (2018), sections 3.6, 6.4 (SARSA) and 11.4 (Bellman residuals); the equations of faults are
+Source: Sutton and Barto (2018), sections 3.6, 6.4 (SARSA) and 11.4 (Bellman residuals). The equations of faults are
 ours.
 """
 
@@ -21,9 +21,9 @@ import numpy as np
 from pharos.benchmark.examination import Examination, WorldArrays
 
 GAMMAS = (0.0, 0.25, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995)
-RIGHT = "right"
+RIGHT_EQUATION = "right"
 EQUATIONS = {
-    RIGHT: "reward, and the discounted value of what comes after",
+    RIGHT_EQUATION: "reward, and the discounted value of what comes after",
     "through_ends": "values go on after the end of an episode",
     "to_next_episode": "values go on into the next episode",
     "cut_is_end": "the time limit counts as an end",
@@ -34,8 +34,8 @@ EQUATIONS = {
     "negative": "rewards have the wrong sign",
 }
 """Equations that values may obey: name -> in words."""
-FLOOR = 0.02  # a residual below it is as good as none
-LEAST = 3  # visits of a pair that counts
+RESIDUAL_FLOOR = 0.02  # a residual below it is as good as none
+LEAST_VISITS = 3  # visits of a pair that counts
 CUTS = 30  # steps, of which one is cut by the time limit in worlds that tell whether it is an end
 SAME = 1e-6
 
@@ -46,7 +46,7 @@ def targets(examination: Examination, gamma: float) -> dict[str, np.ndarray]:
     Args:
         examination: with `q`, (S, A), or `v`, (S,).
     Returns:
-        Arrays of the shape of `q`, or of `v`; those equations alone that the world tells from the right one.
+        Arrays of the shape of `q`, or of `v`, for the equations that the world can distinguish from the right one.
     """
     world, values, v = examination.world, answers_of(examination), state_values(examination)
     q = values if values.ndim == 2 else None
@@ -58,7 +58,7 @@ def targets(examination: Examination, gamma: float) -> dict[str, np.ndarray]:
     onward = moves @ live
     first = world.start @ v
     backups = {
-        RIGHT: rewards + gamma * onward,
+        RIGHT_EQUATION: rewards + gamma * onward,
         "through_ends": rewards + gamma * (moves @ v),
         "to_next_episode": rewards + gamma * ((1 - cuts) * onward + (ends + cuts) * first),
         "cut_is_end": rewards + gamma * (1 - cuts) * onward,
@@ -96,7 +96,7 @@ def earlier_rewards(examination: Examination) -> np.ndarray:
 def weights_of(examination: Examination, visits: np.ndarray) -> np.ndarray:
     """Weights of pairs, or of states if it has values of states alone: roots of visits, which sum to 1."""
     counts = visits if examination.q is not None else visits.sum(axis=1)
-    counts = np.where(counts >= min(LEAST, counts.max()), counts, 0)
+    counts = np.where(counts >= min(LEAST_VISITS, counts.max()), counts, 0)
     roots = np.sqrt(counts)
     return roots / max(roots.sum(), 1e-12)
 
@@ -108,7 +108,7 @@ def deviation(values: np.ndarray, weights: np.ndarray) -> float:
 
 
 def distance(values: np.ndarray, target: np.ndarray, weights: np.ndarray, least: float) -> float:
-    """Root mean square of `values - target` in units of the deviation of the target, or of `least` if that is larger;
+    """Root mean square of `values - target` in units of the deviation of the target, or of `least` if that is larger:
     at most 100.
     """
     error = float(np.sqrt((weights * (values - target) ** 2).sum()))
@@ -147,7 +147,7 @@ def residuals(examination: Examination, visits: np.ndarray | None = None) -> dic
     """Distances from each of the equations that the world tells apart, (len(GAMMAS),) by name.
 
     Args:
-        visits: (S, A), of the pairs that count; None: all of the run.
+        visits: (S, A), of the pairs that count. Default: all of the run.
     """
     weights = weights_of(examination, examination.visits if visits is None else visits)
     values, least = answers_of(examination), least_scale(examination.world)
@@ -170,21 +170,21 @@ def contrast(
     values obey this one. Each with its own discount. NaN: they differ nowhere where it was.
 
     Args:
-        visits: (S, A), of the pairs that count; None: all of the run.
+        visits: (S, A), of the pairs that count. Default: all of the run.
     """
-    other, right = targets(examination, gamma), targets(examination, right_gamma)[RIGHT]
+    other, right = targets(examination, gamma), targets(examination, right_gamma)[RIGHT_EQUATION]
     if name not in other:
         return float("nan")
     weights = weights_of(examination, examination.visits if visits is None else visits)
     values = answers_of(examination)
-    parts = weights * (np.abs(other[name] - other[RIGHT]) > 0.02 * _scale(other[RIGHT], weights))
+    parts = weights * (np.abs(other[name] - other[RIGHT_EQUATION]) > 0.02 * _scale(other[RIGHT_EQUATION], weights))
     if parts.sum() < 1e-3:
         return float("nan")
     parts = parts / parts.sum()
     logs = []
     for target in (other[name], right):
         error = float(np.sqrt((parts * (values - target) ** 2).sum())) / _scale(target, weights)
-        logs.append(np.log10(min(error, 100.0) + FLOOR))
+        logs.append(np.log10(min(error, 100.0) + RESIDUAL_FLOOR))
     return float(logs[0] - logs[1])
 
 
@@ -200,12 +200,12 @@ def cut_shares(examination: Examination, gamma: float, visits: np.ndarray | None
     NaN if the time limit ends less than one in CUTS steps.
 
     Args:
-        visits: (S, A), of the pairs that count; None: all of the run.
+        visits: (S, A), of the pairs that count. Default: all of the run.
     """
     if examination.cuts.sum() * CUTS < examination.visits.sum():
         return float("nan"), float("nan")
     backups, values = targets(examination, gamma), answers_of(examination)
-    right, weights = backups[RIGHT], weights_of(examination, examination.visits if visits is None else visits)
+    right, weights = backups[RIGHT_EQUATION], weights_of(examination, examination.visits if visits is None else visits)
     way, error = backups["cut_is_end"] - right, values - right
     length = float((weights * way**2).sum())
     if length < 1e-12:
@@ -226,7 +226,7 @@ def exact_values(examination: Examination, gamma: float) -> np.ndarray:
 
 
 def optimal(world: WorldArrays, gamma: float, policy: np.ndarray | None = None, sweeps: int = 2000) -> np.ndarray:
-    """(S, A) values of actions of the optimal policy, or of a policy (S, A); by iteration until nothing changes."""
+    """(S, A) values of actions of the optimal policy, or of a policy (S, A), by iteration until nothing changes."""
     q = np.zeros_like(world.rewards)
     for _ in range(sweeps):
         v = q.max(axis=1) if policy is None else (policy * q).sum(axis=1)
@@ -241,25 +241,38 @@ def optimal(world: WorldArrays, gamma: float, policy: np.ndarray | None = None, 
 
 
 def readings(examinations: Sequence[Examination]) -> dict[str, float]:
-    """Numbers that describe an agent, by name; those that do not apply to it are left out.
+    """Numbers that describe an agent, by name. Numbers that do not apply to it are left out.
 
-    Of an agent with values: `gamma`, the discount that fits them best, as log10 of 1 / (1 - gamma); `consistency`,
-    log10 of the residual; of each other equation the residual less the right one's, negative if it fits better;
-    `cut_share` and `cut_partial`, see `cut_shares`; `image` and `image_size`, the residual and `size` if it sees
-    images less the same for others;
-    `cut_partial_late` and `itself_late`, the same in states that it visited in the last fifth alone: values elsewhere
-    lag behind, as if the time limit were an end, or what comes after the state itself;
-    `on_policy`, `consistency` if the next actions count as they were played, see `on_policy`;
-    `slope`, log10 of the factor with which rewards enter; `size`, log10 of the deviation of the values relative to
-    exact ones; `truth`, their correlation with exact ones, and `truth_unvisited` elsewhere; `bias`, their mean error in
-    deviations; `ends`, values of terminal states in deviations; `deaf`, the share of numbers of observations that
-    change nothing, `deaf_last` of last ones; `wavering`, log10 of the change if asked again; `forgets`, the residual
-    in lately visited states less the residual of all; `own`, whether they are nearer to values of its policy than to
-    optimal ones; `far`, the error far from the end less the error near it.
-    Of all: `overlap` of late behaviour with the policy, and `overlap_shifted` with its actions shifted, less that;
-    `random`, entropy of late behaviour, 1 as uniform; `certain`, probability of the likeliest action; `coverage` of
-    states; `behind`, late regret of behaviour less the policy's; `equal_seeds`, share of worlds in which two seeds
-    did the same; `regret` of each world.
+    Of an agent with values:
+
+    - `gamma`: the discount that fits them best, as log10 of 1 / (1 - gamma)
+    - `consistency`: log10 of the residual
+    - of each other equation the residual less the right one's, negative if it fits better
+    - `cut_share` and `cut_partial`: see `cut_shares`
+    - `image` and `image_size`: the residual and `size` if it sees images less the same for others
+    - `cut_partial_late` and `itself_late`: the same in states that it visited in the last fifth alone, as values
+      elsewhere lag behind, as if the time limit were an end, or what comes after the state itself
+    - `on_policy`: `consistency` if the next actions count as they were played, see `on_policy`
+    - `slope`: log10 of the factor with which rewards enter
+    - `size`: log10 of the deviation of the values relative to exact ones
+    - `truth`: their correlation with exact ones, and `truth_unvisited` elsewhere
+    - `bias`: their mean error in deviations
+    - `ends`: values of terminal states in deviations
+    - `deaf`: the share of numbers of observations that change nothing, and `deaf_last` of last ones
+    - `wavering`: log10 of the change if asked again
+    - `forgets`: the residual in lately visited states less the residual of all
+    - `own`: whether they are nearer to values of its policy than to optimal ones
+    - `far`: the error far from the end less the error near it
+
+    Of all:
+
+    - `overlap` of late behaviour with the policy, and `overlap_shifted` with its actions shifted, less that
+    - `random`: entropy of late behaviour, 1 as uniform
+    - `certain`: probability of the likeliest action
+    - `coverage` of states
+    - `behind`: late regret of behaviour less the policy's
+    - `equal_seeds`: share of worlds in which two seeds did the same
+    - `regret` of each world
     """
     numbers: dict[str, float] = {}
     with_values = [each for each in examinations if each.q is not None or each.v is not None]
@@ -271,25 +284,25 @@ def readings(examinations: Sequence[Examination]) -> dict[str, float]:
 
 def _of_values(examinations: Sequence[Examination]) -> dict[str, float]:
     tables = [residuals(each) for each in examinations]
-    logs = [{name: np.log10(row + FLOOR) for name, row in table.items()} for table in tables]
-    right = np.mean([table[RIGHT] for table in logs], axis=0)
-    place = int(right.argmin())
-    gamma = GAMMAS[place]
-    numbers = {"gamma": -np.log10(1 - gamma), "consistency": float(right[place])}
+    logs = [{name: np.log10(row + RESIDUAL_FLOOR) for name, row in table.items()} for table in tables]
+    right = np.mean([table[RIGHT_EQUATION] for table in logs], axis=0)
+    index = int(right.argmin())
+    gamma = GAMMAS[index]
+    numbers = {"gamma": -np.log10(1 - gamma), "consistency": float(right[index])}
     if all(each.q is not None for each in examinations):
-        played = [np.log10(residuals(on_policy(each))[RIGHT] + FLOOR) for each in examinations]
+        played = [np.log10(residuals(on_policy(each))[RIGHT_EQUATION] + RESIDUAL_FLOOR) for each in examinations]
         numbers["on_policy"] = float(np.mean(played, axis=0).min())
     for name in EQUATIONS:
         applicable = [table for table in logs if name in table]
-        if name != RIGHT and applicable:
-            own = GAMMAS[int(np.mean([table.get(name, table[RIGHT]) for table in logs], axis=0).argmin())]
+        if name != RIGHT_EQUATION and applicable:
+            own = GAMMAS[int(np.mean([table.get(name, table[RIGHT_EQUATION]) for table in logs], axis=0).argmin())]
             numbers[name] = _mean_contrast(contrast(each, name, own, gamma) for each in examinations)
             if name == "itself":
                 late = (contrast(each, name, own, gamma, each.late) for each in examinations)
                 numbers["itself_late"] = _mean_contrast(late)
     is_image = np.array([each.name.endswith("image") for each in examinations])
     if 0 < is_image.sum() < len(is_image):
-        at_best = np.array([table[RIGHT][place] for table in logs])
+        at_best = np.array([table[RIGHT_EQUATION][index] for table in logs])
         numbers["image"] = at_best[is_image].mean() - at_best[~is_image].mean()
         sizes = np.array([_size(each, gamma) for each in examinations])
         numbers["image_size"] = sizes[is_image].mean() - sizes[~is_image].mean()
@@ -302,7 +315,7 @@ def _of_values(examinations: Sequence[Examination]) -> dict[str, float]:
 
 
 def _mean_contrast(contrasts: Iterable[float]) -> float:
-    """Mean of those that are numbers; NaN if none is."""
+    """Mean of those that are numbers, or NaN if none is."""
     rows = [each for each in contrasts if np.isfinite(each)]
     return float(np.mean(rows)) if rows else np.nan
 
@@ -325,19 +338,22 @@ def _of_one(examination: Examination, gamma: float) -> dict[str, float]:
         "wavering": np.log10(max(examination.wavering, SAME)),
     }
     if is_new.any():
-        numbers["error_unvisited"] = np.clip(np.log10(error[is_new].mean() + FLOOR), -2, 3)
+        numbers["error_unvisited"] = np.clip(np.log10(error[is_new].mean() + RESIDUAL_FLOOR), -2, 3)
     if world.terminal.any():
         after = values[world.terminal].max(axis=1) if values.ndim == 2 else values[world.terminal]
         numbers["ends"] = np.clip(np.log10(np.abs(after).mean() / max(deviation(values, weights), 1e-9) + 1e-3), -3, 3)
-    late = residuals(examination, examination.last)[RIGHT][GAMMAS.index(gamma)]
-    numbers["forgets"] = np.log10(late + FLOOR) - np.log10(residuals(examination)[RIGHT][GAMMAS.index(gamma)] + FLOOR)
+    late = residuals(examination, examination.last)[RIGHT_EQUATION][GAMMAS.index(gamma)]
+    numbers["forgets"] = np.log10(late + RESIDUAL_FLOOR) - np.log10(
+        residuals(examination)[RIGHT_EQUATION][GAMMAS.index(gamma)] + RESIDUAL_FLOOR
+    )
     numbers["slope"] = np.clip(reward_slope(examination, gamma), -3, 3)
     numbers["cut_share"], numbers["cut_partial"] = cut_shares(examination, gamma)
     _, numbers["cut_partial_late"] = cut_shares(examination, gamma, examination.late)
     if examination.q is not None:
         own = optimal(world, gamma, examination.policy)
         numbers["own"] = np.log10(
-            (distance(values, own, weights, 1e-6) + FLOOR) / (distance(values, exact, weights, 1e-6) + FLOOR)
+            (distance(values, own, weights, 1e-6) + RESIDUAL_FLOOR)
+            / (distance(values, exact, weights, 1e-6) + RESIDUAL_FLOOR)
         )
         numbers["truth_greedy"] = greedy_share(values, exact, weights)
     steps = steps_to_end(world)
@@ -346,7 +362,7 @@ def _of_one(examination: Examination, gamma: float) -> dict[str, float]:
     if 0 < far.sum() < weights.sum():
         near = weights - far
         parts = [(part * error).sum() / part.sum() for part in (far, near)]
-        numbers["far"] = np.clip(np.log10((parts[0] + FLOOR) / (parts[1] + FLOOR)), -2, 2)
+        numbers["far"] = np.clip(np.log10((parts[0] + RESIDUAL_FLOOR) / (parts[1] + RESIDUAL_FLOOR)), -2, 2)
     return {name: float(value) for name, value in numbers.items()}
 
 
@@ -365,7 +381,7 @@ def _size(examination: Examination, gamma: float) -> float:
 
 
 def correlation(x: np.ndarray, y: np.ndarray, weights: np.ndarray) -> float:
-    """Correlation under weights; 0 if one of them is constant."""
+    """Correlation under weights, or 0 if one of them is constant."""
     x, y = x - (weights * x).sum(), y - (weights * y).sum()
     both = float(np.sqrt((weights * x * x).sum() * (weights * y * y).sum()))
     return float((weights * x * y).sum() / both) if both > 1e-12 else 0.0
@@ -381,7 +397,7 @@ def greedy_share(q: np.ndarray, exact: np.ndarray, weights: np.ndarray) -> float
 def reward_slope(examination: Examination, gamma: float) -> float:
     """log10 of the factor with which rewards enter values: the slope of values less discounted next values on rewards.
 
-    NaN if rewards do not differ in states that it visited; -3 if the slope is not positive.
+    NaN if rewards do not differ in states that it visited. -3 if the slope is not positive.
     """
     values, world = answers_of(examination), examination.world
     live = np.where(world.terminal, 0.0, state_values(examination))

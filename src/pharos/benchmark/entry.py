@@ -1,6 +1,6 @@
 """Entries: what one run has learnt and what it claims, as a submission of one task that names itself.
 
-The record has the configuration of the run and the claim; the arrays are the policy, a table or a network. The file
+The record has the configuration of the run and the claim. The arrays are the policy: a table or a network. The file
 has the layout of `system/sealed.py`. Claims have to be computed again (`verify`).
 """
 
@@ -19,9 +19,9 @@ from pharos.system import records, storage
 from pharos.system.sealed import check_values, write_sealed
 from pharos.training import RunConfig, check_agent_files, read_record, read_rows, run_id
 
-POLICY = "policy"
+POLICY_ARRAY = "policy"
 """The array of a tabular agent; a network has arrays by the names of its parameters."""
-_ARRAYS = "arrays"
+_ARRAYS_KEY = "arrays"
 TRAINING = (
     "episodes",
     "cumulative_regret",
@@ -31,7 +31,7 @@ TRAINING = (
     "mean_return",
 )
 """Of the result of a run, what only training again could verify."""
-WHAT = "submission to a benchmark"
+ENTRY_KIND = "submission to a benchmark"
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Claim:
         regret: V* - value.
         value_optimal, value_uniform: V*, and the value of acting uniformly at random.
         exact: whether the value was computed, not estimated.
-        error_bound: how far the value may be off; of an estimate half the width of a 99 % interval.
+        error_bound: how far the value may be off. For an estimate, half the width of a 99 % interval.
     """
 
     value: float
@@ -87,17 +87,17 @@ class Entry:
         return self.config.id
 
     def write(self, file: str | os.PathLike) -> None:
-        """Write the entry to a file, replacing it atomically; the same entry gives the same bytes."""
-        body = {name: value for name, value in vars(self).items() if name != _ARRAYS}
+        """Write the entry to a file, replacing it atomically. The same entry gives the same bytes."""
+        body = {name: value for name, value in vars(self).items() if name != _ARRAYS_KEY}
         record = {**body, "id": self.id, "config": self.config.to_dict(), "claim": asdict(self.claim)}
-        write_sealed(file, record, self.arrays, WHAT, follow=True)
+        write_sealed(file, record, self.arrays, ENTRY_KIND, follow=True)
 
     @staticmethod
     def of_record(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "Entry":
-        """Entry of the record and the arrays of a file; FileFormatError or ValueError if they are damaged."""
+        """Entry of the record and the arrays of a file. FileFormatError or ValueError if they are damaged."""
         check_values(record)
         fields = {name: value for name, value in record.items() if name not in ("format", "id", storage.DIGEST)}
-        entry = records.parse_record(Entry, {**fields, _ARRAYS: arrays}, "its record")
+        entry = records.parse_record(Entry, {**fields, _ARRAYS_KEY: arrays}, "its record")
         if record["id"] != run_id(record["config"]):
             raise ValueError("its configuration is not that of its run")
         if entry.claim.error_bound < 0:
@@ -144,12 +144,12 @@ class Entry:
             rules_version=_rules_version(run, record, config),
             claim=claim,
             training={key: result.get(key) for key in TRAINING} | {"seconds": record.get("seconds")},
-            arrays={POLICY: stored_table(run)} if agent_called(config.agent).has_table else _network(run),
+            arrays={POLICY_ARRAY: stored_table(run)} if agent_called(config.agent).has_table else _network(run),
         )
 
 
 def _rules_version(run: Path, record: dict[str, Any], config: RunConfig) -> int:
-    """Version of the rules that the run recorded; for older runs, without one, the version of the class here."""
+    """Version of the rules that the run recorded. For older runs without one, the version of the class here."""
     stored = record.get("rules_version")
     if isinstance(stored, int) and not isinstance(stored, bool):
         return stored
@@ -163,7 +163,7 @@ def _rules_version(run: Path, record: dict[str, Any], config: RunConfig) -> int:
 
 
 def stored_table(run: Path) -> np.ndarray:
-    """The policy of a run that kept a table; actions in the smallest integer type that holds them.
+    """The policy of a run that kept a table, with actions in the smallest integer type that holds them.
 
     Raises:
         ResultCorrupted: policy.npy cannot be read.

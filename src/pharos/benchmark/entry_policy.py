@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.agents import LIBRARIES, agent_called, agents, algorithm, extractor_class, make_model
-from pharos.benchmark.entry import POLICY, Entry
+from pharos.agents import AGENT_LIBRARIES, agent_called, agents, algorithm, extractor_class, make_model
+from pharos.benchmark.entry import POLICY_ARRAY, Entry
 from pharos.environments import BUILT_IN
 from pharos.errors import FileFormatError, ParameterError, StateSpaceTooLarge, UntrustedCode
 from pharos.observations import names as observation_names
@@ -48,10 +48,10 @@ def policy_of(entry: Entry, task: Task, *, trust: bool = False) -> PolicyLike:
 
 
 def _table(entry: Entry, task: Task) -> np.ndarray:
-    if set(entry.arrays) != {POLICY}:
-        raise FileFormatError(f"a table has the array {POLICY!r} alone; found {', '.join(entry.arrays)}")
+    if set(entry.arrays) != {POLICY_ARRAY}:
+        raise FileFormatError(f"a table has the array {POLICY_ARRAY!r} alone; found {', '.join(entry.arrays)}")
     states, actions = task.mdp.num_states, task.mdp.num_actions
-    return checked_table(entry.arrays[POLICY], (states, actions + 1, actions))
+    return checked_table(entry.arrays[POLICY_ARRAY], (states, actions + 1, actions))
 
 
 def checked_table(table: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -109,7 +109,7 @@ def _known_agent(name: str) -> str:
     if name in agents():
         return name
     module, _, attribute = name.partition(":")
-    if module in LIBRARIES and attribute.isidentifier():
+    if module in AGENT_LIBRARIES and attribute.isidentifier():
         from stable_baselines3.common.base_class import BaseAlgorithm
 
         cls = algorithm(name)
@@ -119,7 +119,7 @@ def _known_agent(name: str) -> str:
 
 
 def _network_options(entry: Entry) -> dict[str, Any]:
-    """Hyperparameters that shape the network; FileFormatError if some are not plain numbers and truths."""
+    """Hyperparameters that shape the network. FileFormatError if some are not plain numbers and truths."""
     hyperparameters = entry.hyperparameters
     options = {name: hyperparameters[name] for name in ("net_arch", "policy_kwargs") if name in hyperparameters}
     kwargs = options.get("policy_kwargs", {})
@@ -206,9 +206,9 @@ def task_of(entry: Entry, trust: bool, max_states: int, values: MutableMapping[s
     if env.version != entry.rules_version:
         raise FileFormatError(
             f"is of version {entry.rules_version} of the rules of {env.name}; this pharos has version {env.version}, "
-            f"another MDP: train again, or verify with the pharos of then ({entry.versions.get('pharos', 'unknown')})"
+            f"another MDP: train again, or verify with pharos {entry.versions.get('pharos', '(of an unknown version)')}"
         )
-    table = entry.arrays.get(POLICY)
+    table = entry.arrays.get(POLICY_ARRAY)
     has_table = agent_called(config.agent).has_table
     limit = len(table) if has_table and table is not None and table.ndim else max_states
     space = build(env, max_states=max(1, limit), progress=False)
@@ -220,7 +220,7 @@ def task_of(entry: Entry, trust: bool, max_states: int, values: MutableMapping[s
 
 
 def task_key(config: RunConfig) -> str:
-    """Digest of the task by which entries are compared: environment, chance, setting of values; 1 and 1.0 are equal."""
+    """Digest of the task by which entries are compared: environment, chance, setting of values. 1 and 1.0 are equal."""
     chance = {name: value for name, value in config.chance.to_dict().items() if value}
     task = [config.environment, config.parameters, chance, config.gamma, config.horizon]
     return storage.digest_of_json(_as_floats(storage.plain(task)))
@@ -235,7 +235,8 @@ def _as_floats(value: object) -> object:
 
 
 def _check_code(config: RunConfig, trust: bool) -> None:
-    """Refuse code, environments and observations that are not part of pharos, unless trusted; not agents."""
+    """Refuse code, environments and observations that are not part of pharos, unless trusted. Agents are not checked
+    here."""
     if trust:
         return
     if config.sources:

@@ -2,7 +2,7 @@
 
 Each run ends in an `Examination`: the world as arrays, how often the agent took which action in which state while it
 learnt, and what its last policy answers about every state. A policy may offer `q_values(observations)`, (N, A), or
-`values(observations)`, (N,); policies of Stable-Baselines3 are asked in their own way.
+`values(observations)`, (N,). Policies of Stable-Baselines3 are asked in their own way.
 """
 
 import contextlib
@@ -33,7 +33,7 @@ from pharos.training import (
     regret,
 )
 
-PROTOCOL = Protocol(steps=4000, evaluations=10, seeds=2)
+EXAMINATION_PROTOCOL = Protocol(steps=4000, evaluations=10, seeds=2)
 LATE, LAST = 0.2, 0.025  # parts of a run
 
 
@@ -85,16 +85,16 @@ class Examination:
     Attributes:
         name: of the world. seed: of the run.
         world: as arrays.
-        visits: (S, A) steps by state and action; late, last: in the last fifth and in the last fortieth.
+        visits: (S, A) steps by state and action. late, last: in the last fifth and in the last fortieth.
         cuts: (S, A) steps after which the time limit ended the episode.
         policy: (S, A) probabilities of the last policy.
         q: (S, A) and v: (S,), if it offers them.
         reaction: (D,) mean change of its answers, or of its policy, if a number of the observation is taken from
             another state, relative to the deviation of answers between states.
         wavering: largest change of its answers if it is asked again, in another order.
-        regret: of the last policy, 0 optimal and 1 as uniform play; late_regret: of the returns of the last fifth.
+        regret: of the last policy, 0 optimal and 1 as uniform play. late_regret: of the returns of the last fifth.
         notes: sentences on what looks like a mistake of its loop, by kind.
-        onward: (S, A) probabilities of the next action whose value counts in a backup; None: the largest value does.
+        onward: (S, A) probabilities of the next action whose value counts in a backup. None if the largest value does.
     """
 
     name: str
@@ -120,7 +120,7 @@ def solved(name: str) -> tuple[Task, WorldArrays, np.ndarray]:
     """Task, arrays and observations of all states of one of WORLDS. UnknownName: there is none of this name."""
     if name not in NAMES:
         raise UnknownName("world", name, NAMES)
-    task = WORLDS[NAMES.index(name)].training_task(PROTOCOL)
+    task = WORLDS[NAMES.index(name)].training_task(EXAMINATION_PROTOCOL)
     mdp, size = task.mdp, task.mdp.num_states
     states = np.arange(size)
     observations: Any = task.observer.observe(task.space.states(states), np.full(size, -1), np.zeros(size, np.int64))
@@ -146,7 +146,7 @@ def solved(name: str) -> tuple[Task, WorldArrays, np.ndarray]:
 
 @dataclass
 class Log:
-    """Steps of all copies of an environment: state before, action, whether time ended the episode; and returns."""
+    """Steps of all copies of an environment: state before, action, whether time ended the episode, and returns."""
 
     states: list[np.ndarray] = field(default_factory=list)
     actions: list[int] = field(default_factory=list)
@@ -184,7 +184,7 @@ class Witness(PolicyRecorder):
     def __init__(self, name: str, seed: int, steps: int):
         self.name, self.seed, self.log = name, seed, Log()
         task, self.world, self.observations = solved(name)
-        super().__init__(task, steps=steps, interval=max(1, steps // PROTOCOL.evaluations), seed=seed)
+        super().__init__(task, steps=steps, interval=max(1, steps // EXAMINATION_PROTOCOL.evaluations), seed=seed)
         self.env = WatchedEnv(task, self.budget, seed, self.log)
         self.answers: tuple[np.ndarray | None, np.ndarray | None, np.ndarray, float] | None = None
 
@@ -252,7 +252,7 @@ class Witness(PolicyRecorder):
 
 
 def table_examination(name: str, seed: int, steps: int, setting: Mapping[str, Any]) -> Examination:
-    """The examination of pharos' own table, `QLearning`, by its counts of visits; it sees states, not numbers."""
+    """The examination of pharos' own table, `QLearning`, by its counts of visits. It sees states, not numbers."""
     task, world, _ = solved(name)
     table = QLearning(task.mdp, total_steps=steps, seed=seed, time_limit=task.time_limit, **setting)
     ends = [int(steps * (1 - LATE)), int(steps * (1 - LAST)), steps]
@@ -279,7 +279,7 @@ def table_examination(name: str, seed: int, steps: int, setting: Mapping[str, An
 
 
 def value_functions(policy: Any) -> tuple[Callable[[Any], np.ndarray] | None, Callable[[Any], np.ndarray] | None]:
-    """Functions of observations to (N, A) values of actions and to (N,) values of states; None if it has none.
+    """Functions of observations to (N, A) values of actions and to (N,) values of states, or None if it has none.
 
     A method of an object that offers them, such as `policy` of a class with act and observe, has the functions of its
     object.
@@ -316,7 +316,7 @@ def learner_of(agent: str | Callable[..., Any], hyperparameters: Mapping[str, An
     """An agent as learn(env, steps, seed).
 
     Args:
-        agent: a generator, or a class with act, observe and policy, or `file.py:Name` of one; or the name or class of
+        agent: a generator, or a class with act, observe and policy, or `file.py:Name` of one. Or the name or class of
             an algorithm of Stable-Baselines3, such as dqn.
     Raises:
         ParameterError, UnknownName: there is no such agent, or it is one in JAX.
@@ -364,7 +364,7 @@ def examine(
     hyperparameters: Mapping[str, Any] | None = None,
     worlds: Sequence[str] = NAMES,
     seeds: Sequence[int] = (0, 1),
-    steps: int = PROTOCOL.steps,
+    steps: int = EXAMINATION_PROTOCOL.steps,
     timeout: float | None = None,
     progress: Callable[[float, str], object] = lambda share, text: None,
 ) -> list[Examination]:
@@ -373,7 +373,8 @@ def examine(
     Args:
         agent, hyperparameters: as `learner_of` takes them.
         worlds: of NAMES. seeds: of the runs of each. steps: of each run.
-        timeout: seconds after which a run is ended; None: never. Counted in the main thread alone, not on Windows.
+        timeout: seconds after which a run is ended, or None for never. Counted in the main thread alone, not on
+            Windows.
         progress: called with the share that is done, and a text.
     Raises:
         ParameterError: it is no agent, or it yields no policy.
@@ -405,4 +406,4 @@ def examine(
 
 
 class OutOfTime(Terminated):
-    """The time of a run is over; `except Exception` of an agent does not catch it."""
+    """The time of a run is over. `except Exception` of an agent does not catch it."""

@@ -1,4 +1,4 @@
-"""Runs of an agent on a suite: all tasks and seeds in one folder; finished runs are kept, missing ones continue.
+"""Runs of an agent on a suite: all tasks and seeds in one folder. Finished runs are kept, missing ones continue.
 
 DIR/suite.json             name, digest and protocol of the suite
 DIR/agent.json             form, source, hyperparameters, versions
@@ -20,7 +20,7 @@ import numpy as np
 
 from pharos.agents import COMPILED
 from pharos.benchmark.agents import Form, Job, OnProgress, RunSettings, agent_form
-from pharos.benchmark.results import FILE, AgentResults
+from pharos.benchmark.results import RESULTS_FILE, AgentResults
 from pharos.benchmark.scores import AxisScore, BenchmarkScore, ConfidenceInterval, equal_seeds, score
 from pharos.benchmark.suite import CORE, EARLIER, BenchmarkTask, Suite, load_suite
 from pharos.errors import AllRunsFailed, FolderLocked, ParameterError, PharosError, UnknownName
@@ -30,7 +30,7 @@ from pharos.system.workers import usable_workers
 from pharos.training import versions
 
 SUITE, AGENT, SCORE = "suite.json", "agent.json", "score.json"
-SHOWN = 200  # characters of what differs
+SHOWN_CHARACTERS = 200  # characters of what differs
 
 
 @dataclass(frozen=True)
@@ -94,20 +94,20 @@ def run(  # noqa: PLR0913
             yields policies. Code that is named here is imported.
         suite: name, file, or a suite that was loaded, by `load_suite(file, trust=True)` if it names code.
         out: folder of one agent with one setting, of one suite.
-        seeds: of the runs of each task; None: as many as the suite asks for, from 0 on.
-        quick: the tasks and the number of seeds that the suite has for a quick look, of v1 the core with three; what is
-            made of it is preliminary.
-        tasks: "core", axes and names of tasks; None: all.
-        name: label of the agent in tables; its own when not given.
-        hyperparameters: of all tasks; they override those that the suite and the agent have.
-        workers: processes; as many as processors when not given. Changes no result.
-        timeout: seconds after which a run of the user's own code, or of Stable-Baselines3, is ended, and failed; None:
+        seeds: of the runs of each task. Default: as many as the suite asks for, from 0 on.
+        quick: the tasks and the number of seeds that the suite has for a quick look, of v1 the core with three. Results
+            of a quick look are preliminary.
+        tasks: "core", axes and names of tasks. Default: all.
+        name: label of the agent in tables. Default: its own.
+        hyperparameters: of all tasks. They override the hyperparameters of the suite and of the agent.
+        workers: processes. Default: as many as processors. Changes no result.
+        timeout: seconds after which a run of the user's own code, or of Stable-Baselines3, is ended, and failed. None:
             never.
         progress: called with the share of all steps that is done, and a text.
     Raises:
         ParameterError: an option is wrong, a task is another one on this installation, or the folder holds another
             agent, setting or suite. AllRunsFailed: no run has finished. FolderLocked: another process is at it.
-    Cost: of v1, 30,000 steps a task and seed; of large, 600,000.
+    Cost: 30,000 steps a task and seed for v1, 600,000 for large.
     """
     folder = Path(out).absolute()  # an agent may change the directory when its file is loaded
     suite = suite if isinstance(suite, Suite) else load_suite(suite)
@@ -151,7 +151,7 @@ def selected(suite: Suite, tasks: str | Iterable[str] | None) -> tuple[Benchmark
     """Tasks of a suite, in its order.
 
     Args:
-        tasks: "core", axes and names; None: all.
+        tasks: "core", axes and names. Default: all.
     Raises:
         UnknownName: there is no such axis or task.
     """
@@ -166,7 +166,7 @@ def selected(suite: Suite, tasks: str | Iterable[str] | None) -> tuple[Benchmark
 
 
 def claimed(folder: Path, form: Form, suite: Suite, label: str) -> Mapping[str, Any]:
-    """Contents of agent.json for this agent and setting; the file is written if it does not exist.
+    """Contents of agent.json for this agent and setting. The file is written if it does not exist.
 
     Raises:
         ParameterError: the folder is of another agent, setting, suite or installation.
@@ -198,8 +198,9 @@ def claimed(folder: Path, form: Form, suite: Suite, label: str) -> Mapping[str, 
         different = [name for name in entry if before.get(name) != entry[name]]
         if different:
             raise ParameterError(
-                f"{folder}: holds runs with another {different[0]}: {str(before.get(different[0]))[:SHOWN]}, now "
-                f"{str(entry[different[0]])[:SHOWN]}; choose another folder, or delete it"
+                f"{folder}: holds runs with another {different[0]}: "
+                f"{str(before.get(different[0]))[:SHOWN_CHARACTERS]}, now "
+                f"{str(entry[different[0]])[:SHOWN_CHARACTERS]}; choose another folder, or delete it"
             )
     return contents[AGENT]
 
@@ -240,7 +241,7 @@ def collected(folder: Path, form: Form, suite: Suite, record: Mapping[str, Any],
     if not whole:
         reason, _ = Counter(missing.values()).most_common(1)[0]
         raise AllRunsFailed(folder, {reason: reason}, outcome)
-    results.write(folder / FILE)
+    results.write(folder / RESULTS_FILE)
     if outcome.scores.has_core:
         storage.replace_json(folder / SCORE, {"agent": results.agent, "suite": suite.name, **asdict(outcome.scores)})
     return outcome
@@ -249,7 +250,7 @@ def collected(folder: Path, form: Form, suite: Suite, record: Mapping[str, Any],
 def mean_facts(facts: Sequence[Mapping[str, Any]], curves: np.ndarray) -> dict[str, float]:
     """Means over the runs of a task: `one_action`, `deterministic` (a share of runs), and `greedy_score`.
 
-    The last is the score if the policies of all evaluations are played greedily; it is left out if none is stochastic.
+    The last is the score if the policies of all evaluations are played greedily. It is left out if none is stochastic.
 
     Args:
         curves: (runs, evaluations) normalised regret of what was played.

@@ -1,9 +1,9 @@
-"""Faults that people make in agents, each a switch of a small DQN or PPO: what `pharos diagnose` knows.
+"""Faults that people faulty_agent in agents, each a switch of a small DQN or PPO: what `pharos diagnose` knows.
 
     pharos diagnose pharos.benchmark.faults:dqn --set fault=target_never_copied
     pharos benchmark run --agent pharos.benchmark.faults:ppo --set fault=gamma_half --out results/fault
 
-Both agents are generators of policies in NumPy alone, with two hidden layers; their policies give `q_values` or
+Both agents are generators of policies in NumPy alone, with two hidden layers. Their policies give `q_values` or
 `values`. Without a fault they are healthy. Sources: Mnih et al. (2015); Schulman et al. (2017); Huang et al. (2022),
 The 37 implementation details of proximal policy optimization.
 """
@@ -75,11 +75,11 @@ FAMILIES = {
 """Families of faults: name -> what they are about, and which."""
 
 
-def make(agent: str, fault: str = HEALTHY, **hyperparameters: Any) -> partial[Iterator["Greedy | Stochastic"]]:
+def faulty_agent(agent: str, fault: str = HEALTHY, **hyperparameters: Any) -> partial[Iterator["Greedy | Stochastic"]]:
     """The agent "dqn" or "ppo" with a fault, as learn(env, steps, seed), which `benchmark.run` and `diagnose` take.
 
     Args:
-        fault: a key of `FAULTS[agent]`; "none": a healthy one.
+        fault: a key of `FAULTS[agent]`, or "none" for a healthy agent.
         hyperparameters: other keywords of `dqn` or `ppo`.
     Raises:
         UnknownName: there is no such agent or fault.

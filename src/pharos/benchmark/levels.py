@@ -28,11 +28,11 @@ from pharos.training import HELD_OUT
 if TYPE_CHECKING:
     from pharos.benchmark.suite import BenchmarkTask, Suite
 
-LEVELS = "levels"
+ENVIRONMENT_NAME = "levels"
 """Environment of a task of a suite that is such a world; its parameters are those of `levels_of`."""
 FIRST_HELD_OUT = 1_000_000
 """Seed of the first held-out level; those of training levels are 0, 1, 2, ..."""
-SEEN = "simple_image"
+OBSERVATION_OF_OVERLAP = "simple_image"
 
 
 def levels_of(world: str, options: Mapping[str, Any], *, train: int, held_out: int = 0) -> Environment:
@@ -48,7 +48,7 @@ def levels_of(world: str, options: Mapping[str, Any], *, train: int, held_out: i
     Cost: 15 ms a level at some hundred states each, the first time.
     """
     key = [world, make(world, **options, seed=0).version, dict(options), train, held_out, mdp_files.VERSION]
-    folder = storage.cache_directory() / LEVELS / storage.digest_of_json(key)
+    folder = storage.cache_directory() / ENVIRONMENT_NAME / storage.digest_of_json(key)
     if not _is_whole(folder):
         if not (folder / storage.LOCK).exists():  # nobody is writing it
             shutil.rmtree(folder, ignore_errors=True)
@@ -57,7 +57,7 @@ def levels_of(world: str, options: Mapping[str, Any], *, train: int, held_out: i
 
 
 def _is_whole(folder: Path) -> bool:
-    """Whether a folder has the levels, undamaged; else they are written anew."""
+    """Whether a folder has the levels, undamaged. If not, they are written anew."""
     try:
         return mdp_files.is_folder(folder) and bool(mdp_files.read_arrays(folder, mdp_files.read_mdp_manifest(folder)))
     except (FileFormatError, ValueError):
@@ -79,7 +79,7 @@ def _write(folder: Path, world: str, options: dict[str, Any], train: int, held_o
             successors.append(np.asarray(space.successors, np.int64) + first)
             rewards.append(np.asarray(mdp.rewards, np.float64))
             terminal.append(np.asarray(mdp.terminal, bool))
-        pictures.append(_cropped(observe(env, SEEN)(states)))
+        pictures.append(_cropped(observe(env, OBSERVATION_OF_OVERLAP)(states)))
         starts.append(first)  # the state that is found first
         first += len(states)
     initial = np.zeros(first)
@@ -113,7 +113,7 @@ def twins(suite: "Suite") -> list[tuple["BenchmarkTask", "BenchmarkTask"]]:
     unsplit = {
         json.dumps({**task.parameters, "held_out": 0}, sort_keys=True): task
         for task in suite.tasks
-        if task.environment == LEVELS and not task.parameters["held_out"]
+        if task.environment == ENVIRONMENT_NAME and not task.parameters["held_out"]
     }
     pairs = []
     for task in suite.tasks:
@@ -124,7 +124,7 @@ def twins(suite: "Suite") -> list[tuple["BenchmarkTask", "BenchmarkTask"]]:
 
 
 def overlap(env: Environment) -> float:
-    """Share of the distinct observations of held-out levels that training levels show as well; terminal states apart.
+    """Share of the distinct observations of held-out levels that training levels show as well, without terminal states.
 
     Args:
         env: of `levels_of`, with held-out levels.

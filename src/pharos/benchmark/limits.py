@@ -12,14 +12,14 @@ class Limits:
 
     Attributes:
         tolerance: how far an exact number may be from the claimed one, relative to V*. For rounding of networks on
-            another processor; times V* if that is larger than 1. Of a suite: of normalised regret.
-        max_states: refuse state spaces larger than this. A table says itself how many states there are; a suite
-            has tasks of its own.
+            another processor, times V* if that is larger than 1. Of a suite: of normalised regret.
+        max_states: refuse state spaces larger than this. A table says itself how many states there are, and a suite has
+            tasks of its own.
         max_reached: values of policies that reach more states are estimated. Up to so many a value is exact. Policies
             of a suite are tables, whose values are exact.
         max_horizon: refuse runs with more steps of an episode than this. A suite has its own.
-        max_seconds: refuse tasks that take longer, each. By the clock, for all of it; counted in the main thread
-            alone, and not on Windows.
+        max_seconds: refuse tasks that take longer, each. By the clock, for all of it. Counted in the main thread alone,
+            and not on Windows.
     """
 
     tolerance: float = parameter(1e-6, low=0)

@@ -2,7 +2,7 @@
 
 `task` gives the environment of a task of a suite, which counts its steps and takes policies. Its files have the form of
 `benchmark.run`, so that reports and comparisons read them. `LoopRun`, which is `pharos.Run`, is the same for any
-environment; its folder has the form of `pharos.train`.
+environment. Its folder has the form of `pharos.train`.
 """
 
 import contextlib
@@ -42,7 +42,7 @@ from pharos.training import (
     write_record,
 )
 
-OWN = "own loop"
+OWN_LOOP = "own loop"
 """Name of an agent that has none."""
 
 
@@ -52,12 +52,12 @@ OWN = "own loop"
 class TaskEnv(CountedEnv):
     """The environment of one task of a suite, for a loop of the user's own. Made by `task`.
 
-    `record(policy)` lets a policy be the one in force from this step on; `steps` are the steps that the task allows,
-    summed over all copies (`copy`). `close`, or the end of a `with` block, evaluates the policies and writes the
-    files; a step beyond the budget raises `BudgetSpent`, which ends such a block quietly.
+    `record(policy)` lets a policy be the one in force from this step on. `steps` are the steps that the task allows,
+    summed over all copies (`copy`). `close`, or the end of a `with` block, evaluates the policies and writes the files.
+    A step beyond the budget raises `BudgetSpent`, which ends such a block quietly.
 
     Attributes:
-        task: of the suite. folder: of the results; None: nothing is written.
+        task: of the suite. folder: of the results. If None, nothing is written.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class TaskEnv(CountedEnv):
         self._form, self._is_closed = Form(agent, "loop", dict(setting)), False
 
     def record(self, policy: PolicyLike) -> None:
-        """Let a policy be the one in force from this step on; it is asked about every state now, and never again.
+        """Let a policy be the one in force from this step on. It is asked about every state now, and never again.
 
         Args:
             policy: a function from (N, ...) observations to (N,) actions or (N, A) probabilities, a model of
@@ -144,7 +144,7 @@ def task(
     suite: str | Path | Suite = "v1",
     seed: int = 0,
     out: str | os.PathLike | None = None,
-    agent: str = OWN,
+    agent: str = OWN_LOOP,
     hyperparameters: Mapping[str, Any] | None = None,
 ) -> TaskEnv:
     """The environment of a task of a suite, which counts its steps and takes the policies of a loop of your own.
@@ -157,10 +157,10 @@ def task(
         name: of the task, as `pharos benchmark show` lists it.
         suite: name, file, or a suite that was loaded.
         seed: of the run.
-        out: folder of one agent with one setting, with the files of `benchmark.run`; results.safetensors has the tasks
+        out: folder of one agent with one setting, with the files of `benchmark.run`. results.safetensors has the tasks
             of which all seeds that are there have finished. None: nothing is written.
         agent: label in tables.
-        hyperparameters: JSON-able, for the record; another setting needs another folder.
+        hyperparameters: JSON-able, for the record. Another setting needs another folder.
     Raises:
         UnknownName: there is no such suite or task. ParameterError: the task is another one on this installation.
     Cost: states of the task are built and solved.
@@ -176,7 +176,7 @@ def task(
 
 
 class LoopRun:
-    """A run whose loop is your own, with the exact regret of its policies; it writes the folder that `train` writes.
+    """A run whose loop is your own, with the exact regret of its policies. It writes the folder that `train` writes.
 
         with pharos.Run("frozen_lake/8x8", observation="one_hot", out="runs/mine") as run:
             observation, _ = run.env.reset()
@@ -187,14 +187,14 @@ class LoopRun:
 
     Args:
         environment: a name, with its parameters as keywords, or an Environment.
-        steps: that `env` allows; the budget of the run.
+        steps: that `env` allows, the budget of the run.
         seed: of `env`, and of the record.
         agent: label of what learns.
-        out: folder of the run; None: nothing is written.
+        out: folder of the run. If None, nothing is written.
         options: of `TrainingOptions`: observation, observation_options, sticky, random and the like, gamma, horizon,
-            objective, evaluation_interval, hyperparameters; and parameters of the environment.
+            objective, evaluation_interval, hyperparameters, and parameters of the environment.
     Attributes:
-        env: the environment, which counts the steps of all of its copies (`env.copy`); use it, or your own.
+        env: the environment, which counts the steps of all of its copies (`env.copy`). Use it, or your own.
         task: environment, observation and setting of values, a `training.Task`.
         rows: of the curve so far, dictionaries with the columns of curve.csv.
         config: the `training.RunConfig`.
@@ -209,7 +209,7 @@ class LoopRun:
         *,
         steps: int = 50_000,
         seed: int = 0,
-        agent: str = OWN,
+        agent: str = OWN_LOOP,
         out: str | os.PathLike | None = None,
         **options: Any,
     ):
@@ -271,7 +271,7 @@ class LoopRun:
         return row
 
     def record(self, policy: PolicyLike) -> dict[str, Any]:
-        """Evaluate a policy after the steps that `env` has counted; see `evaluate`."""
+        """Evaluate a policy after the steps that `env` has counted, as `evaluate` does."""
         return self.evaluate(self.env.budget.steps, policy)
 
     def __enter__(self) -> "LoopRun":

@@ -1,6 +1,6 @@
 """The report of an agent's results: one HTML file that loads and runs nothing, and LaTeX for a paper.
 
-Frontiers and scores stand beside the baselines'; a difference is said in words only if an interval shows it. Of
+Frontiers and scores stand beside the baselines'. A difference is said in words only if an interval shows it. Of
 theory the page has two things: the dashed line on each ladder, and residuals, tasks that an idealised learner solves
 and the agent does not. The page is a tree of elements, so that every text in it is escaped.
 """
@@ -26,10 +26,10 @@ from pharos.benchmark.charts import (
     scatter,
     section,
 )
-from pharos.benchmark.comparison import EQUAL_SEEDS, LEAST, UNKNOWN, WORSE, compare_groups
+from pharos.benchmark.comparison import EQUAL_SEEDS, LEAST_DIFFERENCE, ONE_SEED, WORSE, compare_groups
 from pharos.benchmark.contents import (
     LEARNERS,
-    PREDICTORS,
+    PREDICTOR_PHRASES,
     RESIDUAL,
     Contents,
     Source,
@@ -50,13 +50,13 @@ from pharos.benchmark.contents import (
     unclipped_regret,
 )
 from pharos.benchmark.diagnosis import (
-    OWN,
+    OWN_RESIDUAL,
     SHIPPED,
     fall_everywhere,
     falls,
-    gaps,
     groups_of,
     is_own,
+    level_gaps,
     lowest_rungs,
     nearest,
     policies_of,
@@ -76,7 +76,7 @@ from pharos.plots import agent_label
 from pharos.system import storage
 from pharos.system.wording import pluralize
 
-NO_VERDICT = (UNKNOWN, EQUAL_SEEDS)
+NO_VERDICT = (ONE_SEED, EQUAL_SEEDS)
 
 
 def report(
@@ -93,10 +93,10 @@ def report(
     Args:
         results: folder of a run, file, shipped baseline by name, or results read.
         out: the page, one self-contained file of HTML.
-        beside: agents to stand beside it, as `results`; None: dqn, ppo and q_learning, if shipped.
+        beside: agents to stand beside it, as `results`. Default: dqn, ppo and q_learning, if shipped.
         latex: whether to write a table and a paragraph on methods beside the page, with the ending .tex.
         predictor: idealised learner that the agent is compared with: "dqn", "ppo", "table", "both" (the larger regret
-            of dqn and ppo) or "none"; None: by the agent's name, and "both" if that says nothing.
+            of dqn and ppo) or "none". Default: by the agent's name, and "both" if that says nothing.
         suite: the one that `results` are of, if that is not shipped.
     Raises:
         ParameterError: there are no such results, they are of another suite, or the predictor is none of these.
@@ -111,7 +111,7 @@ def report(
 
 
 def page(contents: Contents) -> str:
-    """The HTML page; every text passes through the tree, which escapes it."""
+    """The HTML page. Every text passes through the tree, which escapes it."""
     title = f"{contents.agent.name} on the Pharos Benchmark {contents.suite.name}"
     sections = [part for make in SECTIONS if (part := make(contents)) is not None]
     return document(title, _lead(contents), sections)
@@ -182,7 +182,7 @@ def _ladders(contents: Contents) -> Element | None:
     if not ladders:
         return None
     is_predicted = any(contents.predicted(task) is not None for ladder in ladders for task in ladder.tasks)
-    theory = f"theory: {PREDICTORS[contents.predictor]}" if is_predicted else None
+    theory = f"theory: {PREDICTOR_PHRASES[contents.predictor]}" if is_predicted else None
     figures = [captioned(ladder.axis, _ladder(contents, ladder), text=ladder.quantity) for ladder in ladders]
     return section(
         "Ladders",
@@ -289,7 +289,7 @@ def _policies(contents: Contents) -> Element | None:
 
 
 def _gaps(contents: Contents) -> Element | None:
-    rows = gaps(contents)
+    rows = level_gaps(contents)
     if not rows:
         return None
     heads = ["generator", "training levels", "score on these", "on held-out levels", "gap"]
@@ -372,7 +372,7 @@ def _words(contents: Contents) -> Element | None:
     return section(
         title,
         "By the scores of axes, as `pharos benchmark compare` says them, after Holm's correction over axes; frontiers "
-        f"say how much that is in the unit of the axis. Scores less than {LEAST:g} apart have no verdict.",
+        f"say how much that is in the unit of the axis. Scores less than {LEAST_DIFFERENCE:g} apart have no verdict.",
         *parts,
     )
 
@@ -384,7 +384,7 @@ def _residuals(contents: Contents) -> Element | None:
     if all(contents.predicted(task) is None for task in contents.suite.tasks):
         return None
     rows = residual_tasks(contents)
-    means = PREDICTORS[contents.predictor]
+    means = PREDICTOR_PHRASES[contents.predictor]
     text = (
         f"Tasks where the regret is more than {RESIDUAL:g} above that of {means}, predicted before any run. Theory "
         "says that an agent of this kind solves them better: look for a bug or a hyperparameter. At the end is "
@@ -405,7 +405,7 @@ def _residuals(contents: Contents) -> Element | None:
     heads = ["task", "observed", "predicted", "residual", "at the end", *(["shipped"] if is_beside else [])]
     names = f"{' and '.join(agent_label(name) for name in SHIPPED[contents.predictor])} of pharos"
     captions = (
-        f"Worse than theory, and by more than {OWN:g} than {names} (the worse of two): look for a bug here.",
+        f"Worse than theory, and by more than {OWN_RESIDUAL:g} than {names} (the worse of two): look for a bug here.",
         f"Theory is too hopeful: {names} fares alike.",
     )
     for caption, cells_of_list in zip(captions, lists, strict=True):

@@ -1,8 +1,8 @@
 """Diagnosis of an agent: symptoms in its values and behaviour, and the nearest of known faults.
 
 `data/fault_profiles.csv` has the readings of small DQNs and PPOs, healthy ones and ones with a fault of `faults.py`,
-each with hyperparameters and seeds of its own; `benchmarks/fault_profiles.py` makes it. Limits of symptoms are the most
-extreme healthy agents in it, with a margin, so that no healthy agent of the table is told that something is wrong.
+each with hyperparameters and seeds of its own. `benchmarks/fault_profiles.py` makes it. Limits of symptoms are the most
+extreme healthy agents in it, with a margin, so that no healthy agent of the table gets a finding.
 The likeness of a fault is its probability by linear discriminant analysis among all faults of the agent's kind. An
 agent that is far from all of them is like none of the known ones.
 
@@ -20,10 +20,10 @@ import numpy as np
 from pharos.benchmark.doctor import EQUATIONS
 from pharos.benchmark.faults import FAMILIES, HEALTHY
 
-FILE = Path(__file__).parent / "data" / "fault_profiles.csv"
+PROFILES_FILE = Path(__file__).parent / "data" / "fault_profiles.csv"
 DECIMALS = 3
 LARGEST = 4.0  # deviations within a fault that a reading counts as being away
-OWN = 0.5  # weight of the deviations alone in the covariance within a fault
+DIAGONAL_WEIGHT = 0.5  # weight of the deviations alone in the covariance within a fault
 INDEPENDENT = 8  # readings that count as independent evidence
 LEAST_MARGIN = 0.3  # of a symptom's margin, that is added to the deviation of healthy agents
 CREDIBLE = 0.6  # likeness from which a fault is said
@@ -42,9 +42,9 @@ class Symptom:
         margin: beyond the most extreme healthy agent. beyond: what it is beyond besides, whatever healthy agents have.
         wrong: sentence, with {value} for `show(reading)`. advice: what to look at.
         faults: of the library that it is a sign of, the most likely first.
-        kind: of agents that it is a symptom of; empty: of all.
+        kind: of agents that it is a symptom of, or empty for all.
         also: another reading that has to be beyond its limit as well, with the same margin and `beyond`: of lately
-            visited states, as values that lag behind elsewhere look like it; empty: none.
+            visited states, as values that lag behind elsewhere look like it. Empty for none.
     """
 
     reading: str
@@ -59,7 +59,7 @@ class Symptom:
     also: str = ""
 
     def limit(self, healthy: Sequence[Mapping[str, float]], reading: str = "") -> float:
-        """The limit by the readings of healthy agents, of its own reading or another one; no limit if they lack it."""
+        """The limit by the readings of healthy agents, of its own reading or another one. No limit if they lack it."""
         sign, name = 1 if self.is_high else -1, reading or self.reading
         values = [sign * each[name] for each in healthy if name in each]
         return sign * (max(max(values) + self.margin, sign * self.beyond) if values else np.inf)
@@ -342,7 +342,7 @@ class Profile:
 @cache
 def shipped() -> tuple[Profile, ...]:
     """Profiles of the library."""
-    with open(FILE, encoding="utf-8", newline="") as lines:
+    with open(PROFILES_FILE, encoding="utf-8", newline="") as lines:
         return tuple(
             Profile(row.pop("agent"), row.pop("fault"), {name: float(text) for name, text in row.items() if text})
             for row in csv.DictReader(lines)
@@ -373,7 +373,7 @@ class Deviations:
     """Distances of an agent from each fault of a library, F, in each of n readings.
 
     Attributes:
-        names: of readings that all have; a reading that is missing on one side says nothing.
+        names: of readings that all have. A reading that is missing on one side says nothing.
         faults: F names, "none" among them. counts: (F,) agents with each.
         rows: (F, n) from the mean of each fault, in deviations within faults. covariance: (n, n) within faults.
     """
@@ -396,13 +396,13 @@ def deviations(numbers: Mapping[str, float], library: Sequence[Profile]) -> Devi
     freedom = max(len(rows) - len(faults), 1)
     units = np.sqrt((within**2).sum(axis=0) / freedom) + 0.05 * rows.std(axis=0) + 1e-3
     standard = within / units
-    covariance = (1 - OWN) * standard.T @ standard / freedom + OWN * np.eye(len(names))
+    covariance = (1 - DIAGONAL_WEIGHT) * standard.T @ standard / freedom + DIAGONAL_WEIGHT * np.eye(len(names))
     x = np.array([numbers[name] for name in names])
     return Deviations(names, faults, members.sum(axis=1), (x - means) / units, covariance)
 
 
 def likeness(numbers: Mapping[str, float], library: Sequence[Profile]) -> dict[str, float]:
-    """Probability of each fault of a library, "none" among them, the largest first; they sum to 1.
+    """Probability of each fault of a library, "none" among them, the largest first. They sum to 1.
 
     Differences of more than LARGEST deviations count as so many.
     """
@@ -458,8 +458,8 @@ def accuracy(kind: str) -> Accuracy:
     """Accuracy of a shipped library for a kind of agent: each of its agents is left out in turn, then its fault."""
     library = [each for each in shipped() if each.kind == kind]
     ranks, healthy, unknown = [], [], []
-    for place, each in enumerate(library):
-        rest = library[:place] + library[place + 1 :]
+    for index, each in enumerate(library):
+        rest = library[:index] + library[index + 1 :]
         if each.fault not in {other.fault for other in rest}:
             continue
         answer = judged(each.readings, rest)
@@ -470,10 +470,10 @@ def accuracy(kind: str) -> Accuracy:
         answer = judged(each.readings, [other for other in rest if other.fault != each.fault])
         own = {fault for _, faults in FAMILIES.values() if each.fault in faults for fault in faults}
         unknown.append(answer.fault in own if answer.fault else bool(answer.findings) or answer.is_strange)
-    places = np.array(ranks)
+    rank = np.array(ranks)
     if not ranks or not healthy:
         return Accuracy(0, *[float("nan")] * 4)
-    shares = (places == 0).mean(), (places < 3).mean(), np.mean(healthy), np.mean(unknown)
+    shares = (rank == 0).mean(), (rank < 3).mean(), np.mean(healthy), np.mean(unknown)
     return Accuracy(len(ranks) + len(healthy), *map(float, shares))
 
 
@@ -484,7 +484,7 @@ def accuracy(kind: str) -> Accuracy:
 class Finding:
     """A symptom that is there: the reading and the limit that no healthy agent passes, in words, and what to try.
 
-    `strength` is how far beyond the limit it is, in deviations of healthy agents; `faults` are what it is a sign of.
+    `strength` is how far beyond the limit it is, in deviations of healthy agents. `faults` are what it is a sign of.
     """
 
     reading: str
@@ -497,7 +497,7 @@ class Finding:
 
 
 def failed(numbers: Mapping[str, float], library: Sequence[Profile]) -> list[Finding]:
-    """Findings of symptoms that are there, the strongest first; of equations the one that fits best.
+    """Findings of symptoms that are there, the strongest first. Of equations only the one that fits best.
 
     Args:
         numbers: readings of an agent. library: profiles, of which the healthy ones set limits.
@@ -532,8 +532,8 @@ class Judgement:
 def judged(numbers: Mapping[str, float], library: Sequence[Profile]) -> Judgement:
     """The answer that a library gives. Signs of the fault that is said come first among the findings.
 
-    The likeliest fault is said if a sign of it is there; without one if it has none, or nothing else is wrong either,
-    and the agent is as near to it as known ones are.
+    The likeliest fault is said if a sign of it is there. Without a sign it is said if it has none, or nothing else is
+    wrong either, and the agent is as near to it as known ones are.
     """
     shares, findings = likeness(numbers, library), failed(numbers, library)
     is_strange = strangeness(numbers, library) > FARTHEST

@@ -1,6 +1,6 @@
 """Properties of the tasks of v1 that are known before any run, by which the report groups them.
 
-`data/task_properties.csv` holds them, by `benchmarks/benchmark_properties.py`; a test computes them again. The digest
+`data/task_properties.csv` holds them, by `benchmarks/benchmark_properties.py`. A test computes them again. The digest
 of a task is its key, so tasks of v1 in a suite of somebody's own have them as well.
 """
 
@@ -17,8 +17,8 @@ from pharos.benchmark.suite import BenchmarkTask, Protocol
 from pharos.mdp import rewards_of_outcomes
 from pharos.policies import evaluate_policy
 
-FILE = Path(__file__).parent / "data" / "task_properties.csv"
-PURPOSES = FILE.with_name("task_purposes.csv")
+PROPERTIES_FILE = Path(__file__).parent / "data" / "task_properties.csv"
+PURPOSES = PROPERTIES_FILE.with_name("task_purposes.csv")
 SHORT, LONG = 32, 400  # steps
 
 
@@ -86,7 +86,7 @@ def known_properties() -> dict[str, TaskProperties]:
         "time_limit": int,
         "constant": float,
     }
-    with open(FILE, encoding="utf-8", newline="") as lines:
+    with open(PROPERTIES_FILE, encoding="utf-8", newline="") as lines:
         rows = [
             TaskProperties(
                 **{each.name: read.get(each.name, "True".__eq__)(row[each.name]) for each in fields(TaskProperties)}
@@ -111,7 +111,7 @@ def _purposes() -> dict[str, Purpose]:
 
 
 def purpose_of(task: BenchmarkTask) -> Purpose | None:
-    """Purpose of a task by its class of environments, and kind of MiniGrid; None for other classes."""
+    """Purpose of a task by its class of environments, and kind of MiniGrid, or None for other classes."""
     name, _, instance = task.environment.partition("/")
     kind = str(task.parameters.get("kind", instance))
     keys = [key for key in _purposes() if key.split()[0] == name and kind.startswith(key.partition(" ")[2])]

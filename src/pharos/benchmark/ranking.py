@@ -3,7 +3,7 @@
 A table for each suite ranks by final policies, and a table for each task that entries name ranks by regret. All else
 that a file says is claimed, and stands in columns that say so: curves while learning cannot be seen from policies.
 
-The page loads nothing and executes nothing but its own few lines, which sort tables; its policy of contents says so to
+The page loads nothing and executes nothing but its own few lines, which sort tables. Its policy of contents says so to
 the browser. All text of files is escaped.
 """
 
@@ -102,17 +102,17 @@ def board(
     progress: ProgressCallback | None = None,
     **options: Any,
 ) -> Board:
-    """Verify submissions, and write a page that ranks them; entries of one task share its solution.
+    """Verify submissions, and write a page that ranks them. Entries of one task share its solution.
 
     Args:
         files: submissions, and folders with *.safetensors in them and below.
         out: the page, one self-contained file of HTML.
-        suites: that they may be of; v1 when none is given.
+        suites: that they may be of. Default: v1.
         title: of the page.
         progress: called with files done, files in all, and the next one.
         trust, options: as for `verify`, for each file.
     Returns:
-        What holds and what was refused; refused files stand at the end of the page, with the reason.
+        What holds and what was refused. Refused files stand at the end of the page, with the reason.
     Raises:
         ParameterError: there are no files. MissingExtra: Jinja2 is not installed.
     """
@@ -141,7 +141,7 @@ def board(
 
 
 def _listed(files: Sequence[str | os.PathLike]) -> Iterator[tuple[str, Path]]:
-    """Yield name on the page and path of each file; of a folder, the files in it and below."""
+    """Yield name on the page and path of each file. For a folder, of the files in it and below."""
     paths = []
     for each in map(Path, files):
         inside = sorted(path for path in each.rglob(f"*{SUFFIX}") if path.is_file())
@@ -236,7 +236,7 @@ def _ranking_of_task(group: list[EntryVerdict]) -> Ranking:
 
 
 def _copies(entry: Entry, group: Sequence[EntryVerdict]) -> str:
-    """Other entries of the same run with bitwise equal arrays; their author cannot be determined."""
+    """Other entries of the same run with bitwise equal arrays. Their author cannot be determined."""
     same = [
         f"{other.name} by {other.author or 'nobody'}"
         for other in (verdict.entry for verdict in group)

@@ -16,8 +16,8 @@ from pharos.benchmark.suite import EARLIER
 from pharos.errors import FileFormatError, ParameterError
 from pharos.system.sealed import check_values, read_sealed, write_sealed
 
-FILE = "results.safetensors"
-WHAT = "result of a benchmark"
+RESULTS_FILE = "results.safetensors"
+RESULTS_KIND = "result of a benchmark"
 BASELINES = Path(__file__).parent / "baselines"
 
 
@@ -27,7 +27,7 @@ class AgentResults:
 
     Attributes:
         agent: label of the agent.
-        suite, digest: name and digest of the suite; an earlier digest of the same tasks becomes today's.
+        suite, digest: name and digest of the suite. An earlier digest of the same tasks becomes today's.
         seeds: of the runs, in the order of the rows.
         curves: name of a task -> (seeds, evaluations) normalised regret (V* - V) / (V* - U) of the policy after each
             equal part of the steps: 0 is optimal, 1 is uniform play, not clipped. Tasks that were not run, or of which
@@ -67,7 +67,7 @@ class AgentResults:
 
     @staticmethod
     def read(source: str | os.PathLike) -> "AgentResults":
-        """Results of the folder of a run, of a file, or of a shipped baseline, by name (`dqn`, of v1; or `v1/dqn`).
+        """Results of the folder of a run, of a file, or of a shipped baseline, by name (`dqn`, of v1, or `v1/dqn`).
 
         Nothing is executed, and nothing is allocated before sizes in the file were held against the size of the file.
 
@@ -78,41 +78,42 @@ class AgentResults:
         path = Path(source)
         suite, _, label = (f"v1/{source}" if "/" not in str(source) else str(source)).rpartition("/")
         if path.is_dir():
-            path = path / FILE
+            path = path / RESULTS_FILE
             if not path.is_file():
                 finished = len(list(Path(source).glob("runs/*/*/curve.*")))
                 raise ParameterError(
-                    f"{path}: no such file; `pharos benchmark run` writes it when its runs have ended, {finished} so "
-                    f"far: the same command goes on; with `--seeds` or `--tasks` of what is there it ends here"
+                    f"{path}: no such file; {finished} runs have finished, some are missing: run the same command "
+                    f"again, or score these alone with --seeds or --tasks"
                 )
         elif not path.exists() and "/" not in suite and label in baselines(suite):
             path = BASELINES / suite / f"{label}.safetensors"
         elif not path.is_file():
             raise ParameterError(
-                f"{source}: no results; expected the folder of a run, its {FILE}, or a baseline: "
+                f"{source}: no results; expected the folder of a run, its {RESULTS_FILE}, or a baseline: "
                 f"{', '.join(baselines(suite)) or 'none is shipped'}"
             )
-        return read_sealed(path, WHAT, _results)
+        return read_sealed(path, RESULTS_KIND, _results)
 
     def write(self, file: str | os.PathLike) -> None:
-        """Replace a file by these results, in one step; the same results give the same bytes."""
+        """Replace a file by these results, in one step. The same results give the same bytes."""
         own = {"agent": self.agent, "suite": self.suite, "suite_digest": self.digest, "seeds": list(self.seeds)}
-        write_sealed(file, {**own, "record": dict(self.record)}, self.curves, WHAT)
+        write_sealed(file, {**own, "record": dict(self.record)}, self.curves, RESULTS_KIND)
 
 
 def baselines(suite: str = "v1") -> tuple[str, ...]:
-    """Names of the results that are shipped for a suite; each is the results file of a run, and says its seeds."""
+    """Names of the results that are shipped for a suite. Each is the results file of a run, and says its seeds."""
     return tuple(sorted(file.stem for file in (BASELINES / suite).glob("*.safetensors")))
 
 
 def _results(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> AgentResults:
     kinds = {"agent": str, "suite": str, "suite_digest": str, "seeds": list, "record": dict}
-    agent, suite, digest, seeds, more = entries_of(record, kinds, WHAT)
+    agent, suite, digest, seeds, more = entries_of(record, kinds, RESULTS_KIND)
     return AgentResults(agent, suite, digest, tuple(seeds), arrays, more)
 
 
 def entries_of(record: Mapping[str, Any], kinds: Mapping[str, type], what: str) -> tuple[Any, ...]:
-    """Entries of the record of a file, in the order of `kinds`; FileFormatError: one is missing or of another type."""
+    """Entries of the record of a file, in the order of `kinds`. FileFormatError if one is missing or of another
+    type."""
     check_values(record)
     wrong = [name for name, kind in kinds.items() if not isinstance(record.get(name), kind)]
     if wrong or not all(type(seed) is int for seed in record["seeds"]):

@@ -2,7 +2,7 @@
 
 The score of a run is 1 minus the mean over its evaluations of the normalised regret (V* - V) / (V* - U), that mean
 clipped to [0, 1] as a whole: evaluations are not clipped one by one, and what lies below 0 by rounding becomes 0. Runs
-(seeds) alone are replications, and tasks are fixed; all else is a mean over runs, then over tasks of equal weight.
+(seeds) alone are replications, and tasks are fixed. All else is a mean over runs, then over tasks of equal weight.
 
 Intervals are Student's t with the standard error over seeds within each task and the degrees of freedom of Welch and
 Satterthwaite. The percentile bootstrap of seeds within tasks is too narrow with few seeds: its spread lacks the factor
@@ -39,7 +39,7 @@ class ConfidenceInterval:
 
     Attributes:
         value: of a frontier that the ladder does not reach: its last or first level.
-        low, high: NaN with one seed; an infinite end of a frontier lies beyond the ladder. Also `lower` and `upper`.
+        low, high: NaN with one seed. An infinite end of a frontier lies beyond the ladder. Also `lower` and `upper`.
         censored: "above" or "below" if the value lies beyond the last or before the first rung, else empty.
     """
 
@@ -64,7 +64,7 @@ class ConfidenceInterval:
 
     @staticmethod
     def of_mean(strata: Sequence[np.ndarray], bounds: tuple[float, float] = UNBOUNDED) -> "ConfidenceInterval":
-        """Mean over tasks of the mean over runs, with Student's interval clipped to `bounds`; NaN without tasks."""
+        """Mean over tasks of the mean over runs, with Student's interval clipped to `bounds`, or NaN without tasks."""
         return ConfidenceInterval(*statistics.mean_interval(strata, bounds))
 
     def text(self, *, ends: bool = True) -> str:
@@ -82,7 +82,7 @@ class ConfidenceInterval:
     __str__ = text
 
 
-UNKNOWN = ConfidenceInterval(math.nan)
+UNKNOWN_INTERVAL = ConfidenceInterval(math.nan)
 
 
 def _digits(number: float) -> str:
@@ -95,9 +95,9 @@ class AxisScore:
 
     Attributes:
         unit: of the frontier.
-        score: mean over the rungs, in [0, 1]; of pairs 1 less the mean loss, the score of the first less the second's.
-        frontier: level at which the mean normalised regret crosses 0.5; NaN of pairs, and if one rung alone was run.
-        lowest: score on the first rung; NaN if it was not run.
+        score: mean over the rungs, in [0, 1]. Of pairs 1 less the mean loss: the score of the first less the second's.
+        frontier: level at which the mean normalised regret crosses 0.5. NaN for pairs, and if one rung alone was run.
+        lowest: score on the first rung, or NaN if it was not run.
         fall: `lowest` less the mean score on the rungs above it: what the axis adds to the difficulty of its world.
     """
 
@@ -105,8 +105,8 @@ class AxisScore:
     unit: str
     score: ConfidenceInterval
     frontier: ConfidenceInterval
-    lowest: ConfidenceInterval = field(default=UNKNOWN)
-    fall: ConfidenceInterval = field(default=UNKNOWN)
+    lowest: ConfidenceInterval = field(default=UNKNOWN_INTERVAL)
+    fall: ConfidenceInterval = field(default=UNKNOWN_INTERVAL)
 
     def to_dict(self) -> Mapping[str, Mapping[str, object]]:
         """Score and frontier, for JSON."""
@@ -119,11 +119,11 @@ class BenchmarkScore:
     """All scores of an agent on a suite.
 
     Attributes:
-        core: mean over the tasks of the core of the mean score over the run; NaN if none was run, as the next three.
+        core: mean over the tasks of the core of the mean score over the run. NaN if none was run, as the next three.
         final: the same of the last evaluation alone.
         iqm: mean of the middle half of all runs of all core tasks, pooled as in Agarwal et al. (2021).
         optimality_gap: mean over core runs of max(0, regret): 1 - core, but runs below random count in full.
-        axes: by axis; tasks: score by name, the core's and the ladders'.
+        axes: by axis. tasks: score by name, the core's and the ladders'.
         preliminary: fewer seeds than the suite asks for, 10 of v1, or tasks without results.
         below_random: tasks whose mean normalised regret exceeds 1 by its whole interval.
         missing: tasks of the suite without results, which no score contains.
@@ -151,7 +151,7 @@ class BenchmarkScore:
 
 
 def score(results: "AgentResults", suite: "Suite") -> BenchmarkScore:
-    """Return the scores of an agent's results on a suite; the optimal policy scores 1 and uniform play 0.
+    """Return the scores of an agent's results on a suite. The optimal policy scores 1 and uniform play 0.
 
     Raises:
         ParameterError: the results belong to another suite.
@@ -178,7 +178,7 @@ def score(results: "AgentResults", suite: "Suite") -> BenchmarkScore:
 
 
 def axis_score(ladder: "Ladder", runs: Mapping[str, np.ndarray]) -> AxisScore | None:
-    """Return score and frontier over the rungs that have runs; None if none has.
+    """Return score and frontier over the rungs that have runs, or None if none has.
 
     Args:
         runs: task name -> (seeds,) scores of its runs.
@@ -189,22 +189,22 @@ def axis_score(ladder: "Ladder", runs: Mapping[str, np.ndarray]) -> AxisScore | 
     rungs = [task for task in ladder.tasks if task.name in weights]
     own = [runs[task.name] for task in rungs]
     if ladder.pairs:
-        return AxisScore(ladder.axis, ladder.unit, _contrast(own, list(weights.values()), 1.0), UNKNOWN)
+        return AxisScore(ladder.axis, ladder.unit, _contrast(own, list(weights.values()), 1.0), UNKNOWN_INTERVAL)
     levels = np.array([task.level for task in rungs], np.float64)
     several = len(rungs) > 1
     return AxisScore(
         ladder.axis,
         ladder.unit,
         ConfidenceInterval.of_mean(own, (0.0, 1.0)),
-        frontier(levels, [1.0 - x for x in own]) if several else UNKNOWN,
+        frontier(levels, [1.0 - x for x in own]) if several else UNKNOWN_INTERVAL,
         *((ConfidenceInterval.of_mean(own[:1], (0.0, 1.0)), _fall(own)) if rungs[0] is ladder.tasks[0] else ()),
     )
 
 
 def _fall(rungs: Sequence[np.ndarray]) -> ConfidenceInterval:
-    """Mean on the first rung less the mean over the others, with Student's interval; NaN with one rung."""
+    """Mean on the first rung less the mean over the others, with Student's interval, or NaN with one rung."""
     if len(rungs) < 2:
-        return UNKNOWN
+        return UNKNOWN_INTERVAL
     return _contrast(rungs, [1.0, *[-1.0 / (len(rungs) - 1)] * (len(rungs) - 1)])
 
 
@@ -214,23 +214,23 @@ def _contrast(strata: Sequence[np.ndarray], weights: Sequence[float], constant: 
     return ConfidenceInterval(*statistics.student_interval(value, *statistics.standard_error(strata, weights)))
 
 
-def check_suite(results: "AgentResults", suite: "Suite", whose: str = "") -> None:
+def check_suite(results: "AgentResults", suite: "Suite", source: str = "") -> None:
     """Refuse results of another suite, by name.
 
     Args:
-        whose: the file that they are of, for messages.
+        source: the file that they come from, for messages.
     Raises:
         ParameterError: the digest is another one, or there are curves of tasks that are not in the suite.
     """
     if results.digest != suite.digest:
         raise ParameterError(
-            f"{f'{whose}: ' * bool(whose)}results of {results.agent} are of suite {results.suite} with digest "
+            f"{f'{source}: ' * bool(source)}results of {results.agent} are of suite {results.suite} with digest "
             f"{results.digest[:12]}; expected {suite.name} with {suite.digest[:12]}: run the agent on that suite, or "
             f"name its suite (--suite)"
         )
     if unknown := sorted({*results.curves} - {task.name for task in suite.tasks}):
         raise ParameterError(
-            f"{whose or f'results of {results.agent}'}: curves of {unknown[0]!r}, which is no task of suite "
+            f"{source or f'results of {results.agent}'}: curves of {unknown[0]!r}, which is no task of suite "
             f"{suite.name}"
         )
 
@@ -256,12 +256,12 @@ def _shows_learning(curve: np.ndarray) -> bool:
 
 
 def has_equal_seeds(results: "AgentResults") -> bool:
-    """Whether the seeds are one run, by `equal_seeds`; False if no run learns, as with a fixed policy."""
+    """Whether the seeds are one run, by `equal_seeds`. False if no run learns, as with a fixed policy."""
     return bool(equal_seeds(results.curves))
 
 
 def as_one_run(results: "AgentResults") -> "AgentResults":
-    """The results; if their seeds are one run, their mean as a single one, so that nothing has an interval."""
+    """The results. If their seeds are one run, their mean as a single one, so that nothing has an interval."""
     if not has_equal_seeds(results):
         return results
     curves = {name: curve.mean(axis=0, keepdims=True) for name, curve in results.curves.items()}
@@ -292,7 +292,7 @@ def frontier(levels: np.ndarray, regrets: Sequence[np.ndarray]) -> ConfidenceInt
         levels: (R,) increasing. regrets: for each rung the mean regret of its runs in [0, 1].
     Returns:
         Censored "above" with the last level if even that rung stays below 0.5, "below" with the first one if that
-        exceeds it; an end of the interval beyond the ladder is infinite.
+        exceeds it. An end of the interval beyond the ladder is infinite.
     """
     from scipy.optimize import isotonic_regression
 

@@ -1,6 +1,6 @@
 """Submissions: what an agent has learnt and what it claims, in one file, which `verify` checks by computing it again.
 
-`submit` packs the folder of one training run (`entry.py`) or of runs of a suite; a file has the layout of
+`submit` packs the folder of one training run (`entry.py`) or of runs of a suite. A file has the layout of
 `system/sealed.py`. The arrays of a suite's runs are
 
     curve/TASK        (seeds, evaluations) float64, normalised regret
@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from pharos.benchmark.entry import WHAT, Entry, stored_table
+from pharos.benchmark.entry import ENTRY_KIND, Entry, stored_table
 from pharos.benchmark.results import AgentResults, entries_of
 from pharos.benchmark.scores import check_suite
 from pharos.benchmark.suite import Suite, load_suite
@@ -36,7 +36,7 @@ class Submission:
     """A submission: curves, final policies, and the texts of its author.
 
     Attributes:
-        results: curves of the agent. policies: (task, seed) -> final policy; policies of some runs may be missing.
+        results: curves of the agent. policies: (task, seed) -> final policy. Policies of some runs may be missing.
         author, note: texts to show.
     """
 
@@ -46,7 +46,7 @@ class Submission:
     note: str = ""
 
     def write(self, file: str | os.PathLike) -> None:
-        """Write the submission to a file, replacing it atomically; the same submission gives the same bytes."""
+        """Write the submission to a file, replacing it atomically. The same submission gives the same bytes."""
         results = self.results
         record = {
             "name": results.agent,
@@ -59,18 +59,18 @@ class Submission:
         }
         arrays = {f"curve/{task}": curve for task, curve in results.curves.items()}
         arrays |= {f"policy/{task}/{seed}": policy for (task, seed), policy in self.policies.items()}
-        write_sealed(file, record, arrays, WHAT, follow=True)
+        write_sealed(file, record, arrays, ENTRY_KIND, follow=True)
 
     @staticmethod
     def read(file: str | os.PathLike) -> "Submission":
-        """Read runs of a suite; raises as `pharos.benchmark.read`, also for the run of one task."""
-        return read_sealed(file, WHAT, Submission.of_record)
+        """Read runs of a suite. Errors are those of `pharos.benchmark.read`, also for the run of one task."""
+        return read_sealed(file, ENTRY_KIND, Submission.of_record)
 
     @staticmethod
     def of_record(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> "Submission":
-        """Submission of the record and the arrays of a file; FileFormatError or ValueError if they are damaged."""
+        """Submission of the record and the arrays of a file. FileFormatError or ValueError if they are damaged."""
         kinds = {"name": str, "author": str, "note": str, "suite": str, "suite_digest": str, "seeds": list}
-        values = entries_of(record, {**kinds, "record": dict}, WHAT)
+        values = entries_of(record, {**kinds, "record": dict}, ENTRY_KIND)
         name, author, note, suite, digest, seeds, provenance = values
         curves, policies = {}, {}
         for key, array in arrays.items():
@@ -90,7 +90,8 @@ class Submission:
     def of_folder(
         folder: Path, suite: Suite, *, trust: bool = False, progress: ProgressCallback | None = None
     ) -> "Submission":
-        """Results in the folder of `benchmark.run` and the final policies of its runs; raises as `submit`."""
+        """Results in the folder of `benchmark.run` and the final policies of its runs. Errors are the same as for
+        `submit`."""
         results = AgentResults.read(folder)
         check_suite(results, suite, str(folder))
         if large := [task for task in suite.tasks if task.stored and task.name in results.curves]:
@@ -123,7 +124,7 @@ def read(file: str | os.PathLike) -> Entry | Submission:
     def content(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Entry | Submission:
         return (Submission if "suite" in record else Entry).of_record(record, arrays)
 
-    return read_sealed(file, WHAT, content)
+    return read_sealed(file, ENTRY_KIND, content)
 
 
 def submit(
@@ -137,22 +138,22 @@ def submit(
     trust: bool = False,
     progress: ProgressCallback | None = None,
 ) -> Path:
-    """Pack what a finished run, or the runs of a suite, have learnt and claim into one file; return the file.
+    """Pack what a finished run, or the runs of a suite, have learnt and claim into one file, and return the file.
 
     Nothing is trained: values and regret come from the runs' evaluations. The same folder and texts give the same
-    bytes. A network of a suite is asked about every state once; policies that see more than the state have no table.
+    bytes. A network of a suite is asked about every state once. Policies that see more than the state have no table.
 
     Args:
         folder: of a run, or of `benchmark.run`.
-        file: ends in .safetensors; None: in the current directory ID.safetensors, ID the id of the run, or the name of
-            the folder of a suite's runs.
-        suite: that the runs are of; None: v1. Not needed for one run.
-        name: label; None: the agent's.
+        file: ends in .safetensors. Default: ID.safetensors in the current directory, with the id of the run or the name
+            of the folder of a suite's runs.
+        suite: that the runs are of. Default: v1. Not needed for one run.
+        name: label. Default: the agent's.
         author, note: texts to show beside it.
         trust: whether code that the run.json of a suite's run names, the class of an agent, may be imported.
     Raises:
-        ParameterError: the folder holds no results, or of another suite; the environment of a run is an imported MDP,
-            which others do not have; a text cannot be printed.
+        ParameterError: the folder holds no results, or results of another suite. Or the environment of a run is an
+            imported MDP, which others do not have, or a text cannot be printed.
         FileFormatError: a run is damaged or not finished. ResultCorrupted: files are not the ones that its run.json has
             checksums of. UntrustedCode: a run names code, and is not trusted.
         MissingExtra: a run is of a network, and PyTorch is not installed.
@@ -201,7 +202,7 @@ def final_policy(run: Path, task: Task, *, trust: bool = False) -> np.ndarray | 
     if (run / "policy.npy").exists():
         table = stored_table(run)
     elif (run / "agent").is_dir():
-        table = Snapshots(task).taken(load_agent(run, trust=trust)[1])
+        table = Snapshots(task).evaluate(load_agent(run, trust=trust)[1])
     else:
         return None
     if not isinstance(table, np.ndarray) or table.ndim > 2:

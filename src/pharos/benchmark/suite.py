@@ -8,7 +8,7 @@
     quick: {tasks: [names], seeds: 3}      of a quick look; left out: the core, three seeds
     ladders: [{axis, unit, quantity, measure, tasks: [tasks, the easiest first]}]
 
-A task is an entry with the fields of `BenchmarkTask`, but its axis; empty ones are left out. Names say little about a
+A task is an entry with the fields of `BenchmarkTask`, but its axis. Empty ones are left out. Names say little about a
 world: two libraries had a deep_sea whose actions meant other things. So a task is known by its arrays.
 """
 
@@ -18,6 +18,7 @@ import os
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ EARLIER = {"3a1d2bb3986015bb807c596528212e8ea9f8c6579252bc3f53c70a8e596665fe": V
 CORE = "core"
 PAIRS = "pairs"
 """Measure of an axis of pairs: one world in two ways, and how much worse an agent is at the second."""
-BITS = 40
+MANTISSA_BITS = 40
 """Of a mantissa that enter a digest, 12 digits: what compilers and processors may round differently is beyond."""
 SAMPLED = 4096
 """States of a large task whose rewards and observations enter its digest."""
@@ -56,7 +57,7 @@ class Protocol:
 
     Attributes:
         steps: of an agent, on each task. evaluations: points of the curve, equally far apart, the last one at the end.
-        seeds: runs of each task that a score which is not preliminary has; 0 to seeds - 1.
+        seeds: runs of each task that a score which is not preliminary has: 0 to seeds - 1.
         gamma, horizon: of values, as `pharos.training.Task` takes them.
     """
 
@@ -78,16 +79,16 @@ class BenchmarkTask:
 
     Attributes:
         name: unique in its suite, and fit for a file name (`check_name`), since runs are written below it.
-        environment, parameters: as `pharos.make` takes them; or "levels", with those of `levels_of`.
+        environment, parameters: as `pharos.make` takes them, or "levels", with the parameters of `levels_of`.
         observation, observation_options: as `pharos.observe`.
         chance: the kinds of `ChanceSetting` that are not 0.
         axis: "core", or the axis of its ladder.
-        level: on a ladder: the measured quantity, in the ladder's unit; None in the core.
+        level: on a ladder the measured quantity, in the ladder's unit. None in the core.
         predicted: by `pharos.predict`, normalised regret, 0 optimal and 1 uniform play: "dqn", "ppo", and "table",
-            for the DQN with a table; some may be missing.
+            for the DQN with a table. Some may be missing.
         value_optimal, value_uniform: at the start, of the optimal policy and of uniform play.
-        digest: SHA-256 of the task as it was frozen; see `digest_of_task`.
-        seconds: processor time of one run of a baseline that was measured, by its name; a guide.
+        digest: SHA-256 of the task as it was frozen, see `digest_of_task`.
+        seconds: processor time of one run of a baseline that was measured, by its name. A guide, no limit.
         stored: of a large task, which is not solved before each run: its number of `states`, value of the `worst`
             policy, `lowest` and `highest` return of an episode, and `error_bound` of all its values. Empty: it is
             solved.
@@ -119,20 +120,20 @@ class BenchmarkTask:
 
     @property
     def stored_values(self) -> TaskValues | None:
-        """Values at the start of a large task, as they were frozen; None: they are to be solved for."""
+        """Values at the start of a large task, as they were frozen, or None if they are to be solved for."""
         if not (own := self.stored):
             return None
         reference = ReferenceValues(self.value_optimal, self.value_uniform, own["worst"], own["error_bound"])
         return TaskValues(reference, (own["lowest"], own["highest"]))
 
     def training_task(self, protocol: Protocol) -> Task:
-        """The task as agents are trained on it; nothing is built before it is needed."""
+        """The task as agents are trained on it. Nothing is built before it is needed."""
         if protocol.gamma == 1.0 and protocol.horizon in (None, "none"):
             raise ParameterError(
                 f"task {self.name}: gamma is 1 without a horizon, so regret may be infinite, and no score a mean of "
                 f"it; give a horizon, or gamma < 1"
             )
-        if self.environment == levels.LEVELS:
+        if self.environment == levels.ENVIRONMENT_NAME:
             world: tuple[Any, ...] = (levels.levels_of(**self.parameters),)
         else:
             world = self.environment, self.parameters
@@ -147,7 +148,7 @@ class BenchmarkTask:
         )
 
     def check(self, protocol: Protocol) -> Task:
-        """The task as agents are trained on it; ParameterError if it is another task on this installation.
+        """The task as agents are trained on it. ParameterError if it is another task on this installation.
 
         Cost: its states are built, and solved unless it is large.
         """
@@ -172,12 +173,12 @@ class BenchmarkTask:
 
 @dataclass(frozen=True)
 class Ladder:
-    """One world that gets harder along one quantity; or pairs of tasks.
+    """One world that gets harder along one quantity, or pairs of tasks.
 
     Attributes:
         axis: such as "exploration". unit: of the levels, such as "bits". quantity: what a level is, in words.
-        tasks: with increasing levels; of pairs first and second in turn, with levels 0 and 1.
-        measure: by which `benchmarks/benchmark_select.py` finds the levels; "pairs" if tasks are pairs.
+        tasks: with increasing levels. Of pairs first and second in turn, with levels 0 and 1.
+        measure: by which `benchmarks/benchmark_select.py` finds the levels, or "pairs" if tasks are pairs.
     """
 
     axis: str
@@ -188,14 +189,14 @@ class Ladder:
 
     @property
     def pairs(self) -> tuple[tuple[BenchmarkTask, BenchmarkTask], ...]:
-        """Pairs of tasks, of which the second is the first made harder; none of a ladder that gets harder."""
+        """Pairs of tasks, of which the second is the first made harder. None for a ladder that gets harder."""
         return tuple(zip(self.tasks[::2], self.tasks[1::2], strict=True)) if self.measure == PAIRS else ()
 
     def weights(self, names: Container[str]) -> dict[str, float]:
         """Weight in the score of the axis of each task that is in `names`.
 
         Of rungs equal ones, whose sum is 1. Of pairs 1 / n and -1 / n, of the second and the first task of each of n
-        whole pairs; the sum is 0.
+        whole pairs, whose sum is 0.
         """
         if self.measure != PAIRS:
             run = [task.name for task in self.tasks if task.name in names]
@@ -211,9 +212,9 @@ class Suite:
     Attributes:
         name: such as "v1". protocol: of all tasks.
         core: tasks that a score is the mean of. ladders: one for each axis.
-        digest: SHA-256 of all the rest; see `digest_of_suite`.
+        digest: SHA-256 of all the rest, see `digest_of_suite`.
         hyperparameters: of baselines by name, one setting for all tasks.
-        quick: of a quick look, the names of its `tasks` and how many `seeds`; empty: the core, three seeds.
+        quick: of a quick look, the names of its `tasks` and how many `seeds`. Empty: the core, three seeds.
     """
 
     name: str
@@ -244,7 +245,7 @@ class Suite:
         return {task.name: task for task in self.tasks}
 
     def task(self, name: str) -> BenchmarkTask:
-        """The task of this name; UnknownName if there is none."""
+        """The task of this name. UnknownName if there is none."""
         if name not in self._by_name:
             raise UnknownName(f"task of suite {self.name}", name, self._by_name)
         return self._by_name[name]
@@ -281,72 +282,107 @@ def load_suite(name_or_file: str | Path = "v1", *, trust: bool = False) -> Suite
     return suite
 
 
-def suite_of(entry: object, whose: str) -> Suite:
-    """A suite from the entries of its file; checked to be complete and to have the digest that it names.
+def suite_of(entry: object, source: str) -> Suite:
+    """A suite from the entries of its file, checked to be complete and to have the digest that it names.
 
     Raises:
-        FileFormatError: an entry is missing, unknown, of another type or damaged; `whose` says of which file.
+        FileFormatError: an entry is missing, unknown, of another type or damaged. `source` names the file.
     """
     keys = [each.name for each in fields(Suite)]
     if not isinstance(entry, dict) or {*entry, "quick"} != {*keys}:
-        raise FileFormatError(f"{whose}: is no suite; expected the entries {', '.join(keys)}")
+        raise FileFormatError(f"{source}: is no suite; expected the entries {', '.join(keys)}")
     ladders: list[Ladder] = []
-    for each in _list(entry["ladders"], f"{whose}: ladders"):
-        of = f"{whose}: ladder {each.get('axis')}"
+    for each in _list(entry["ladders"], f"{source}: ladders"):
+        of = f"{source}: ladder {each.get('axis')}"
         tasks = _tasks(each.get("tasks"), str(each.get("axis")), of)
         ladders.append(replace(parse_record(Ladder, {**each, "tasks": ()}, of, ("measure",)), tasks=tasks))
         if ladders[-1].measure == PAIRS and len(tasks) % 2:
             raise FileFormatError(f"{of}: has {len(tasks)} tasks; expected pairs")
+        _check_levels(ladders[-1], of)
     settings = entry["hyperparameters"]
     if not isinstance(settings, dict) or not all(isinstance(each, dict) for each in settings.values()):
-        raise FileFormatError(f"{whose}: hyperparameters are {str(settings)[:60]}; expected some of each baseline")
+        raise FileFormatError(f"{source}: hyperparameters are {str(settings)[:60]}; expected some of each baseline")
     quick = entry.get("quick", {})
     if not isinstance(quick, dict) or not {*quick} <= {"tasks", "seeds"}:
-        raise FileFormatError(f"{whose}: quick is {str(quick)[:60]}; expected tasks and seeds")
+        raise FileFormatError(f"{source}: quick is {str(quick)[:60]}; expected tasks and seeds")
     suite = Suite(
         str(entry["name"]),
-        parse_record(Protocol, entry["protocol"], f"{whose}: protocol"),
-        _tasks(entry["core"], CORE, f"{whose}: core"),
+        parse_record(Protocol, entry["protocol"], f"{source}: protocol"),
+        _tasks(entry["core"], CORE, f"{source}: core"),
         tuple(ladders),
         str(entry["digest"]),
         settings,
         quick,
     )
     if len(suite._by_name) < len(suite.tasks):
-        raise FileFormatError(f"{whose}: two tasks have the same name; expected a name of its own for each")
+        raise FileFormatError(f"{source}: two tasks have the same name; expected a name of its own for each")
     names = {CORE, *suite._by_name, *(ladder.axis for ladder in ladders)}
     tasks, seeds = quick.get("tasks", [CORE]), quick.get("seeds", QUICK)
     if not isinstance(tasks, list) or not tasks or not all(isinstance(each, str) and each in names for each in tasks):
-        raise FileFormatError(f"{whose}: quick has the tasks {str(tasks)[:60]}; expected names of its tasks and axes")
+        raise FileFormatError(f"{source}: quick has the tasks {str(tasks)[:60]}; expected names of its tasks and axes")
     if type(seeds) is not int or not 1 <= seeds <= MOST_QUICK:
-        raise FileFormatError(f"{whose}: quick has {str(seeds)[:20]} seeds; expected 1 to {MOST_QUICK:,}")
+        raise FileFormatError(f"{source}: quick has {str(seeds)[:20]} seeds; expected 1 to {MOST_QUICK:,}")
     try:
         digest = digest_of_suite(suite)
     except (TypeError, ValueError, RecursionError):
-        raise FileFormatError(f"{whose}: is no suite; expected entries that JSON has: text, numbers, lists") from None
+        raise FileFormatError(f"{source}: is no suite; expected entries that JSON has: text, numbers, lists") from None
     if digest != suite.digest:
         raise FileFormatError(
-            f"{whose}: what it says has the digest {digest[:16]}...; it names {suite.digest[:16]}...: it was changed; "
+            f"{source}: what it says has the digest {digest[:16]}...; it names {suite.digest[:16]}...: it was changed; "
             f"take the file as it was published"
         )
     return suite
 
 
-def _list(value: object, whose: str) -> list[dict[str, Any]]:
+def _check_levels(ladder: Ladder, source: str) -> None:
+    """Raise FileFormatError if levels are not finite and increasing, or, of pairs, 0 and 1 in turn."""
+    levels = [task.level for task in ladder.tasks]
+    numbers = [level for level in levels if level is not None and abs(level) < HUGE]
+    is_pairs = ladder.measure == PAIRS
+    is_right = levels == [0, 1] * (len(levels) // 2) if is_pairs else all(x < y for x, y in pairwise(numbers))
+    if not levels or len(numbers) < len(levels) or not is_right:
+        expected = "0 and 1 in turn" if is_pairs else "increasing numbers"
+        raise FileFormatError(f"{source}: has the levels {str(levels)[:60]}; expected {expected}")
+
+
+def _list(value: object, source: str) -> list[dict[str, Any]]:
     if not isinstance(value, list) or not all(isinstance(each, dict) for each in value):
-        raise FileFormatError(f"{whose}: expected a list of objects")
+        raise FileFormatError(f"{source}: expected a list of objects")
     return value
 
 
-def _tasks(entries: object, axis: str, whose: str) -> tuple[BenchmarkTask, ...]:
+def _tasks(entries: object, axis: str, source: str) -> tuple[BenchmarkTask, ...]:
     optional = [each.name for each in fields(BenchmarkTask) if each.name not in ("name", "environment", "digest")]
     try:
-        return tuple(
-            parse_record(BenchmarkTask, {**each, "axis": axis}, f"{whose}: task {str(each.get('name'))[:60]}", optional)
-            for each in _list(entries, whose)
+        tasks = tuple(
+            parse_record(
+                BenchmarkTask, {**each, "axis": axis}, f"{source}: task {str(each.get('name'))[:60]}", optional
+            )
+            for each in _list(entries, source)
         )
     except ParameterError as error:  # of a name
-        raise FileFormatError(f"{whose}: {error}") from None
+        raise FileFormatError(f"{source}: {error}") from None
+    for task in tasks:
+        _check_values(task, source)
+    return tasks
+
+
+def _check_values(task: BenchmarkTask, source: str) -> None:
+    """Raise FileFormatError for values that are huge, or, of a large task, which nobody solves again, contradictory."""
+    own, uniform, optimal = task.stored, task.value_uniform, task.value_optimal
+    if abs(uniform) >= HUGE or abs(optimal) >= HUGE:
+        raise FileFormatError(
+            f"{source}: task {task.name}: values are {str(uniform)[:20]}, {str(optimal)[:20]}; expected finite numbers"
+        )
+    if not own:
+        return
+    bound, slack = own["error_bound"], own["error_bound"] + TOLERANCE * abs(own["worst"])
+    is_right = own["lowest"] <= own["highest"] and own["states"] >= 1 and own["states"] % 1 == 0
+    if not (is_right and own["worst"] <= uniform + slack and 0 <= bound < optimal - uniform):
+        raise FileFormatError(
+            f"{source}: task {task.name}: stored is {str(own)[:120]}, uniform play {uniform}, optimal play {optimal}; "
+            f"expected states, worst <= uniform < optimal, lowest <= highest, and 0 <= error_bound < optimal - uniform"
+        )
 
 
 def digest_of_suite(suite: Suite) -> str:
@@ -361,7 +397,7 @@ def digest_of_suite(suite: Suite) -> str:
 
 
 def _entries(suite: Suite) -> dict[str, Any]:
-    """Entries of the file of a suite, JSON-able; empty `quick` and `stored` are left out, as v1 has neither."""
+    """Entries of the file of a suite, JSON-able. Empty `quick` and `stored` are left out, as v1 has neither."""
     entry = storage.plain(asdict(suite))
     tasks = [*entry["core"], *(task for ladder in entry["ladders"] for task in ladder["tasks"])]
     for each, name in [(entry, "quick"), *((task, "stored") for task in tasks)]:
@@ -371,7 +407,7 @@ def _entries(suite: Suite) -> dict[str, Any]:
 
 
 def frozen(task: BenchmarkTask, protocol: Protocol) -> BenchmarkTask:
-    """A copy of the task with its digest and values. Cost: as solving it; a large task has its values already."""
+    """A copy of the task with its digest and values. Cost: as solving it. A large task has its values already."""
     solved = task.training_task(protocol)
     if task.stored:
         return replace(task, digest=digest_of_large_task(solved))
@@ -463,9 +499,9 @@ def _arrays(mdp: TabularMDP) -> Iterable[np.ndarray]:
 
 
 def rounded(values: np.ndarray) -> np.ndarray:
-    """Numbers with mantissas of BITS bits; zero has no sign."""
+    """Numbers with mantissas of MANTISSA_BITS bits. Zero has no sign."""
     mantissa, exponent = np.frexp(np.asarray(values, np.float64))
-    return np.ldexp(np.round(np.ldexp(mantissa, BITS)), exponent - BITS) + 0.0
+    return np.ldexp(np.round(np.ldexp(mantissa, MANTISSA_BITS)), exponent - MANTISSA_BITS) + 0.0
 
 
 def _canonical(value: object) -> bytes:

@@ -40,8 +40,8 @@ class Check:
     """A claimed number beside the computed one.
 
     Attributes:
-        name: of an entry "value", "regret", "value_optimal" or "value_uniform"; of a suite TASK/SEED.
-        claimed, found: the two numbers; of a suite normalised regret.
+        name: of an entry "value", "regret", "value_optimal" or "value_uniform". Of a suite: TASK/SEED.
+        claimed, found: the two numbers, for a suite normalised regrets.
         within: how far apart they may be.
     """
 
@@ -65,7 +65,7 @@ class Verdict:
         checks: claimed numbers beside computed ones.
         refused: name of a claim, task or run -> why it cannot be true, whatever was computed.
         missing: runs without a policy, of which nothing was computed: all that is said of them is claimed.
-        final: final score, computed from the policies: 1 less normalised regret, clipped to [0, 1]; of a suite the mean
+        final: final score, computed from the policies: 1 less normalised regret, clipped to [0, 1]. Of a suite the mean
             over the seeds of a task, then over the tasks of the core, and a run without a policy counts as 0.
     """
 
@@ -83,7 +83,7 @@ class Verdict:
 
     @property
     def holds(self) -> bool:
-        """Whether all that can be computed is as claimed, and possible; the rest stays claimed."""
+        """Whether all that can be computed is as claimed, and possible. The rest stays claimed."""
         return not self.refused and not self.wrong
 
     @property
@@ -112,11 +112,11 @@ class EntryVerdict(Verdict):
     Attributes:
         entry: what was verified.
         value, regret: of the policy, as they were computed.
-        normalized_regret: regret / (V* - U); NaN if V* = U.
+        normalized_regret: regret / (V* - U), or NaN if V* = U.
         value_optimal, value_uniform: V* and U, computed.
-        exact: whether the value is computed; else it is estimated from episodes.
-        error_bound: how far the value may be off; of an estimate half the width of a 99 % interval.
-        states: in which the policy was asked; episodes: behind an estimate.
+        exact: whether the value is computed. If not, it is estimated from episodes.
+        error_bound: how far the value may be off. For an estimate, half the width of a 99 % interval.
+        states: in which the policy was asked. episodes: behind an estimate.
     """
 
     entry: Entry
@@ -143,23 +143,23 @@ def verify(
 ) -> EntryVerdict | SubmissionVerdict:
     """Compute values and regret of the policies in a file again, and compare them with its claims.
 
-    The states of each task are enumerated from pharos' own rules, solved, and the policy is evaluated on them; of the
+    The states of each task are enumerated from pharos' own rules, solved, and the policy is evaluated on them. Of the
     file only numbers and names are used.
 
     Of one task a claim holds if its interval (its error bound) and the computed one meet, if it is not above V*, and if
     its interval is narrower than V* - U. A value that can only be estimated is estimated from other episodes than the
-    run's own. Of a suite the last point of each curve holds or does not; a curve that is better than the optimal policy
+    run's own. Of a suite the last point of each curve holds or does not. A curve that is better than the optimal policy
     is refused.
 
     Args:
-        suite: of runs of a suite, or several that it may be; v1 when not given. Its tasks are the ones on this
+        suite: of runs of a suite, or several that it may be. Default: v1. Its tasks are the ones on this
             installation, not the tasks in the file.
         trust: whether code that an entry names may be imported: an environment, observation or agent that is no part
-            of pharos or Stable-Baselines3. It comes from this machine; no file holds any.
+            of pharos or Stable-Baselines3. It comes from this machine, as no file holds any.
         values: filled with the values of each task of an entry, for the entries that follow.
         progress: called with tasks done, tasks in all, and the next one.
-        options: of `Limits`: tolerance; beyond max_states, max_horizon or max_seconds a task is refused, and beyond
-            max_reached states that the policy of an entry reaches its value is estimated.
+        options: of `Limits`. Beyond max_states, max_horizon or max_seconds a task is refused. If the policy of an entry
+            reaches more than max_reached states, its value is estimated.
     Raises:
         ParameterError: there is no such file, it is of another suite, or a task of the suite is another one on this
             installation. FileFormatError: it is no submission, or not one of this version of the rules.
@@ -310,7 +310,7 @@ def _regret(policy: np.ndarray, task: Task, entry: BenchmarkTask) -> float:
 def _memory_limit() -> Iterator[None]:
     """Raise MemoryError if the block requests more memory than is free, before the system kills the process.
 
-    On Linux, by RLIMIT_DATA of the whole process; elsewhere there is no limit.
+    On Linux, by RLIMIT_DATA of the whole process. Elsewhere there is no limit.
     """
     statistics = Path("/proc/self/statm")
     if not statistics.exists():

@@ -45,7 +45,7 @@ class Answer(NamedTuple):
     failed: bool = False
 
     def say(self, json: bool) -> None:
-        """Print it; typer.Exit if it says that something failed."""
+        """Print it. typer.Exit if it says that something failed."""
         if json:
             print_json(self.json)
         elif isinstance(self.text, tuple):
@@ -59,12 +59,12 @@ class Answer(NamedTuple):
 
 
 def print_json(answer: Mapping[str, Any]) -> None:
-    """Print one JSON object on standard output; infinity and NaN become null."""
+    """Print one JSON object on standard output. Infinity and NaN become null."""
     print(json.dumps(storage.plain(answer), default=_plain, allow_nan=False))
 
 
 def _plain(value: object) -> object:
-    """JSON form of a value that is neither a number nor text: sets, dataclasses; text of all else."""
+    """JSON form of a value that is neither a number nor text: sets, dataclasses. Anything else becomes text."""
     if isinstance(value, set | frozenset):
         return storage.plain(list(value))
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -73,7 +73,7 @@ def _plain(value: object) -> object:
 
 
 def console(*, stderr: bool = False) -> "Console":
-    """A Rich console; outside a terminal 160 columns wide, so that a pipe gets whole lines, without trailing blanks."""
+    """A Rich console, outside a terminal 160 columns wide, so that a pipe gets whole lines, without trailing blanks."""
     from rich.console import Console
 
     stream = sys.stderr if stderr else sys.stdout
@@ -166,7 +166,8 @@ class ProgressLine:
 
 @contextlib.contextmanager
 def progress_line(what: str, *, logged: bool = False) -> Iterator[ProgressLine]:
-    """Report progress in a line on standard error: on a terminal always, and removed at the end; else if it is slow.
+    """Report progress in a line on standard error: on a terminal always, and removed at the end, elsewhere if it is
+    slow.
 
     Args:
         logged: whether each text is a separate line if there is no terminal, as in a log.
@@ -236,7 +237,7 @@ def print_table(
     """Print a table below its title and the lines `before`, with notes below.
 
     Args:
-        columns: their names; `>name` has numbers, which end at one place.
+        columns: their names. `>name` has numbers, which end at one place.
     """
     from rich.markup import escape
     from rich.table import Table
@@ -261,10 +262,10 @@ def print_table(
 
 
 class GrowingTable:
-    """A table whose rows are printed one by one; what is too long for its column goes on in the next line.
+    """A table whose rows are printed one by one. What is too long for its column goes on in the next line.
 
     Args:
-        columns: name to width; `>name` has numbers, which end at one place; of width 0: a share of what is left.
+        columns: name to width. `>name` has numbers, which end at one place. Width 0 means a share of what is left.
     """
 
     def __init__(self, columns: Mapping[str, int]):
@@ -319,7 +320,7 @@ def written(value: object) -> str:
 
 
 def compiling_fact() -> list[tuple[str, str]]:
-    """Seconds of compiling in this command as a fact; none if they are few."""
+    """Seconds of compiling in this command as a fact, or none if they are few."""
     seconds = compiling.seconds()
     suffix = "" if storage.is_cache_temporary() else ", kept for the next time"
     return [("compiling", f"{seconds:.1f} s{suffix}")] if seconds >= NOTABLE_SECONDS else []
@@ -346,7 +347,7 @@ def bytes_of(folder: Path) -> int:
 
 @contextlib.contextmanager
 def termination() -> Iterator[None]:
-    """Turn SIGTERM into SystemExit in the block, so that running work ends first; prints that the command resumes."""
+    """Turn SIGTERM into SystemExit in the block, so that running work ends first. Prints that the command resumes."""
 
     def leave(number: int, frame: FrameType | None) -> None:
         if is_importing(frame):  # if SystemExit may be lost

@@ -50,7 +50,7 @@ NO_ARRAY = ("array is too big", "Maximum allowed dimension exceeded")
 
 
 class _Group(TyperGroup):
-    """Runs a command; errors that pharos or the system raise on purpose end as one line, never as a traceback."""
+    """Runs a command. Errors that pharos or the system raise on purpose end as one line, never as a traceback."""
 
     def main(self, *args: Any, **options: Any) -> object:
         options["standalone_mode"] = False
@@ -109,7 +109,7 @@ def _comes_from_interrupt(error: BaseException | None) -> bool:
 
 
 def _exit_code(error: Exception) -> int | None:
-    """Print an error as one line on standard error and return its exit code; None for a bug of pharos."""
+    """Print an error as one line on standard error and return its exit code. None for a bug of pharos."""
     if isinstance(error, BrokenPipeError):  # the reader had enough, as in `pharos list | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_FAILED

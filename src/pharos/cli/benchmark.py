@@ -94,19 +94,19 @@ def run(
     timeout: float | None = None,
     trust: Trust = False,
 ) -> Answer:
-    """Run an agent on the tasks of a suite. The same command resumes; what is finished stays.
+    """Run an agent on the tasks of a suite. The same command resumes, and what is finished stays.
 
     Args:
         agent: A name (dqn, ppo, q_learning, a2c, oracle, random), module:Class or file.py:Class, or file.py:learn.
         out: Write the runs and results of one agent with one setting into this folder.
         suite: Run the tasks of this suite.
         hyperparameters: Set a hyperparameter, for all tasks.
-        seeds: Number of seeds, from 0 on; or a range, such as 1000:1003. Default: as many as the suite asks for.
-        quick: Run a first look, of v1 the first three seeds of the core alone; results are preliminary.
+        seeds: Number of seeds, from 0 on, or a range, such as 1000:1003. Default: as many as the suite asks for.
+        quick: Run a first look, of v1 the first three seeds of the core alone. Results are preliminary.
         tasks: Run only the core, an axis or a task. Repeatable.
         name: Label in tables. Default: the agent's name.
         workers: Number of processes. Default: as many as processors.
-        timeout: End a run of your own code, or of Stable-Baselines3, after this many seconds; it has failed then.
+        timeout: End a run of your own code, or of Stable-Baselines3, after this many seconds, as failed.
     """
     from pharos import benchmark
 
@@ -171,13 +171,13 @@ def check(
     workers: Count | None = None,
     timeout: float = 120.0,
 ) -> Answer:
-    """Try an agent on two tiny tasks, and report each fault in one line; exit code 1 if there is one.
+    """Try an agent on two tiny tasks, and report each fault in one line. Exit code 1 if there is one.
 
     Args:
         agent: As for `benchmark run`, such as file.py:learn.
         hyperparameters: Set a hyperparameter, for both tasks.
         workers: Number of processes. Default: as many as processors.
-        timeout: End a run after this many seconds; it has failed then.
+        timeout: End a run after this many seconds, as failed.
     """
     from pharos import benchmark
 
@@ -221,7 +221,7 @@ def submit(
     note: str = "",
     trust: Trust = False,
 ) -> Answer:
-    """Pack what a run, or the runs of a suite, have learnt and claim into one file; anybody can compute it again.
+    """Pack what a run, or the runs of a suite, have learnt and claim into one file. Anybody can compute it again.
 
     Args:
         folder: Folder of one finished run, or of `benchmark run`.
@@ -262,7 +262,7 @@ def verify(
     limits: Limits,
     trust: Trust = False,
 ) -> Answer:
-    """Solve the tasks of submissions and evaluate their policies again; exit code 1 if one is not as claimed.
+    """Solve the tasks of submissions and evaluate their policies again. Exit code 1 if one is not as claimed.
 
     Args:
         files: Files from `benchmark submit`.
@@ -362,7 +362,7 @@ def board(
     limits: Limits,
     trust: Trust = False,
 ) -> Answer:
-    """Verify submissions, and write a page that ranks them by what was computed; all else on it is claimed.
+    """Verify submissions, and write a page that ranks them by what was computed. All else on it is claimed.
 
     Args:
         files: Submissions, and folders with submissions in them or below.
@@ -392,7 +392,7 @@ def _entry(task: "BenchmarkTask") -> dict[str, Any]:
 
 
 def _minutes(suite: "Suite") -> dict[str, float]:
-    """Minutes of one processor for all seeds of all tasks, by baseline; a task without a time counts as the mean."""
+    """Minutes of one processor for all seeds of all tasks, by baseline. A task without a time counts as the mean."""
     times: dict[str, list[float]] = {}
     for task in suite.tasks:
         for agent, seconds in task.seconds.items():
@@ -438,7 +438,7 @@ def compare(results: Annotated[list[str], "A B..."], *, suite: SuiteOption = Non
     """Compare an agent with others: per axis, per task and on the core, with 95 % intervals over seeds.
 
     Args:
-        results: Folders of runs, files of results, or baselines by name; the first against each of the others.
+        results: Folders of runs, files of results, or baselines by name. The first is compared with each of the others.
         tasks: Print each task as well.
     """
     from pharos import benchmark

@@ -71,7 +71,7 @@ def build(building: SharedBuilding, target: Target, *, out: Path | None = None) 
 
 
 def _outcomes(space: "StateSpace") -> list[tuple[str, str]]:
-    """Numbers of outcomes of actions as a fact; none if the rules have no chance."""
+    """Numbers of outcomes of actions as a fact, or none if the rules have no chance."""
     if not space.has_chance:
         return []
     manifest = space.manifest
@@ -112,7 +112,7 @@ def count(target: Target, *, building: Building) -> Answer:
 
 
 def _table_of(goal: Target) -> "TabularMDP":
-    """The imported table; the horizon, which a file of BRIDGE may not tell, does not matter here."""
+    """The imported table. The horizon, which a file of BRIDGE may lack, does not matter here."""
     try:
         return goal.mdp()
     except ParameterError:
@@ -120,7 +120,7 @@ def _table_of(goal: Target) -> "TabularMDP":
 
 
 def _counts_of_space(goal: Target, building: Building) -> dict[str, int]:
-    """Counts of a folder, or of the cache if the space is there; else it is built beside the cache and removed."""
+    """Counts of a folder, or of the cache if the space is there. Otherwise it is built beside the cache and removed."""
     from pharos.state_space import cached_folder, load, read_manifest
     from pharos.system import storage
 
@@ -199,7 +199,7 @@ def check(target: Target, *, max_states: Count = 1000) -> Answer:
     """Check an environment against the contract, state by state, and whether any policy beats uniform play.
 
     Args:
-        max_states: Check at most this many states; more for a larger sample.
+        max_states: Check at most this many states. Raise it for a larger sample.
     """
     env = target.found_environment()
     from pharos import check_environment

@@ -168,7 +168,7 @@ def warm(
 
 
 def _use(env: "Environment", chance: ChanceSetting) -> None:
-    """Do a little of everything with an environment; a space beyond LARGEST states is stepped through alone."""
+    """Do a little of everything with an environment. A space beyond LARGEST states is stepped through alone."""
     from pharos import hardness, solvers, state_space
     from pharos.interaction import GymEnv, VectorEnv
     from pharos.kernels import outcomes

@@ -113,7 +113,7 @@ def _of_fields(cls: "type[DataclassInstance]", values: object, docs: Mapping[str
 
 
 def _typed(name: str, hint: object, default: object, text: str | None, is_argument: bool = False) -> inspect.Parameter:
-    """A parameter as Typer reads it; flags, values and help in its annotation take precedence."""
+    """A parameter as Typer reads it. Flags, values and help in its annotation take precedence."""
     parts = get_args(hint) if get_origin(hint) in (UnionType, Union) else (hint,)
     notes = [note for part in parts for note in getattr(part, "__metadata__", ())]
     hint = functools.reduce(

@@ -36,7 +36,7 @@ def diagnose(
         results: Read the folder of a finished `benchmark run` in place of an agent. Nothing is trained.
         hyperparameters: Set a hyperparameter of the agent.
         seeds: Number of seeds of each world, from 0 on.
-        steps: Training steps of each run; the table of known faults has 4,000.
+        steps: Training steps of each run. The table of known faults has 4,000.
         timeout: End the command if a run takes more than this many seconds.
         out: Write the page to FILE.md or FILE.html, which loads nothing.
     """

@@ -60,8 +60,8 @@ def solve(
         reach: Compute probabilities and costs of reaching terminal, a label, an expression such as 'x=3 & !done', or
             states such as 5,7, instead of values.
         out: Write the arrays v and policy to FILE.npz, or the policy alone to FILE.npy.
-        values: Keep the values in this folder if memory has no room for them; an interrupted solve resumes.
-        print_policy: Print the action of each state that the policy reaches; with --reach for the least cost, or for
+        values: Keep the values in this folder if memory has no room for them. An interrupted solve resumes.
+        print_policy: Print the action of each state that the policy reaches. With --reach for the least cost, or for
             the largest probability if the target may be missed.
         policy_rows: Print at most this many states of the policy.
     """
@@ -315,7 +315,7 @@ def evaluate(
     Only a policy that sees several frames and reaches more than 100,000 histories is estimated, from 2,000 episodes.
 
     Args:
-        policy: optimal, uniform, worst; FILE.npy: actions (S,), probabilities (S, A); or a finished run's folder.
+        policy: optimal, uniform, worst, FILE.npy with actions (S,) or probabilities (S, A), or a finished run's folder.
     """
     from pharos.regret import ReferenceValues, regret
 
@@ -445,7 +445,7 @@ def _worth(solution: "Solution") -> Worth:
 
 
 def _worth_of_named(mdp: "TabularMDP", name: str, tolerance: float) -> Worth:
-    """Worth of one of POLICIES; all but the best may go on for ever, if the total reward has no limit."""
+    """Worth of one of POLICIES. All but the best may go on for ever, if the total reward has no limit."""
     from pharos.policies import endless_value
 
     began = time.perf_counter()
@@ -511,10 +511,10 @@ def solution_of(mdp: "TabularMDP", policy: str, decisions: Given | None, toleran
 
 
 def read_policy(name: str, *, trust: bool = False) -> Given:
-    """The policy in a file: .npy, or `policy` of .npz; or what a finished run has learnt, in the folder of the run.
+    """The policy in a file: .npy, or `policy` of .npz, or what a finished run has learnt, in the folder of the run.
 
     Args:
-        trust: whether code that the run names may be imported; what the command names itself is imported before.
+        trust: whether code that the run names may be imported. What the command names itself is imported before.
     Returns:
         The policy, and how `pharos.evaluate_policy` is to take it.
     Raises:

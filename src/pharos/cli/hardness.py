@@ -74,10 +74,10 @@ def hardness(
         network: mlp128, mlp128x2, cnn16, nature, or your own file.py:function. Default: the agents' network.
         initialisation: Initialisation of the network: pytorch (the default, as in DQN) or sb3 (as in PPO and A2C).
         optimizer: Optimizer of the idealised learner: gradient (the default), or adam, which rescales gradients.
-        landmarks: Landmarks of the kernel approximation; 0 turns it off. Default: only above 4,096 observations.
+        landmarks: Landmarks of the kernel approximation. 0 turns it off. Default: only above 4,096 observations.
         definitions: Show definitions and sources.
         latex: Print a LaTeX table.
-        values: Keep values and bounds in this folder while they are computed, in place of memory; an interrupted
+        values: Keep values and bounds in this folder while they are computed, in place of memory. An interrupted
             computation resumes.
         fresh: Compute measures anew, even if they are stored beside the state space.
     """
@@ -229,7 +229,7 @@ def _print_notes(report: "Report") -> None:
 
 
 def _ties(report: "Report") -> list[str]:
-    """Number of gaps that count as ties, with the tolerance, as a note; none without a measure of gaps."""
+    """Number of gaps that count as ties, with the tolerance, as a note. None without a measure of gaps."""
     for result in report.results.values():
         details = {} if result.undefined else result.certificate.details
         if "ties" in details:
@@ -266,19 +266,19 @@ def predict(
         agent: dqn or ppo.
         steps: Training steps to predict for.
         pilot: Also train one seed for this share of the steps: 0.1, 0.25 or 0.5. Predictions then use both.
-        preset: Use the hyperparameters of the published cells, for which the interval is calibrated; --set overrides
+        preset: Use the hyperparameters of the published cells, for which the interval is calibrated. --set overrides
             them.
         horizon: Steps of an episode. Default: the environment's time limit.
-        landmarks: Landmarks of the kernel approximation; 0 turns it off. Default: only above 2,048 observations.
+        landmarks: Landmarks of the kernel approximation. 0 turns it off. Default: only above 2,048 observations.
         plot: Draw the bars into a PNG, PDF or SVG file.
     """
     env = target.found_environment()
-    from pharos.prediction import predict as foretell
+    from pharos.prediction import predict as predict_regret
 
     if preset not in (None, "common"):
         raise UnknownName("set of hyperparameters", str(preset), ("common",))
     with progress_line("predicting") as report:
-        prediction = foretell(
+        prediction = predict_regret(
             env,
             [_observation(text) for text in observation or ["vector"]],
             networks=network or None,

@@ -79,7 +79,7 @@ def gymnasium(
     initial: Annotated[str | None, "STATE,..."] = None,
     check: bool = True,
 ) -> Answer:
-    """Import the table P of an environment of Gymnasium; training takes its time limit.
+    """Import the table P of an environment of Gymnasium. Training takes its time limit.
 
     Args:
         name: Name of an environment with a table P, such as Taxi-v4.
@@ -106,7 +106,7 @@ def gymnasium(
 
 
 def _start_states(text: str) -> int | list[int]:
-    """States from 3, or 0,3,5; ParameterError if it is no such thing."""
+    """States from 3, or 0,3,5. ParameterError if it is no such thing."""
     try:
         states = [int(part) for part in text.split(",")]
     except ValueError:
@@ -132,13 +132,13 @@ def env(
     workers: Count = 1,
     check: bool = True,
 ) -> Answer:
-    """Import any environment of Gymnasium or JAX by stepping it from every state; the same command resumes.
+    """Import any environment of Gymnasium or JAX by stepping it from every state. The same command resumes.
 
     Args:
         target: gymnasium:ID, gymnax:ID, pgx:ID, module:factory, file.py:factory, or jax:file.py:factory.
         option: Option of the environment or the factory, such as is_slippery=false.
         seed: Import the start of the reset with this seed. Default: all starts.
-        key: module:function or file.py:function (environment) -> equal for equal states; pairs are checked.
+        key: module:function or file.py:function (environment) -> equal for equal states. Pairs are checked.
         ignore: Leave these fields out of the state, such as counters of steps: FIELD,FIELD.
         reward: module:function or file.py:function (reward) -> number.
         weights: Weights of a vector of rewards, such as 1,0.5.
@@ -205,7 +205,7 @@ def atari(
         settle: Steps without an action after the last one, whose rewards count. Default: 200 in skiing, else 0.
         raw: Keep states that cannot be distinguished.
         max_states: Refuse more states than these.
-        workers: Processes that share the work; the result is the same.
+        workers: Processes that share the work. The result is the same.
     """
     from pharos import importers
 
@@ -254,7 +254,7 @@ def procgen(
         all_actions: Take all 15 actions, in place of the actions that BRIDGE takes.
         raw: Keep states that cannot be distinguished.
         max_states: Refuse more states than these.
-        workers: Processes that share the work; the result is the same.
+        workers: Processes that share the work. The result is the same.
     """
     from pharos import importers
 
@@ -289,13 +289,13 @@ def prism(
     horizon: Episode = None,
     tolerance: Tolerance = 1e-6,
 ) -> Answer:
-    """Import a model in PRISM's language, in JANI or in Storm's DRN; with a property, answer it.
+    """Import a model in PRISM's language, in JANI or in Storm's DRN. With a property, answer it.
 
     Args:
-        file: A model: .prism, .nm, .pm, .jani or .drn; built by Storm.
+        file: A model: .prism, .nm, .pm, .jani or .drn, built by Storm.
         constants: Values of undefined constants, such as N=3,K=2.
         reward: Reward structure. Default: the only one, if there is no --target.
-        target: Label or expression that ends the episode; pays 1 if there is no --reward.
+        target: Label or expression that ends the episode. It pays 1 if there is no --reward.
         property: Property to compute, such as 'Pmax=? [F "goal" & !x=3]' or 'Rmin{"steps"}=? [F "goal"]', or its name
             in a JANI file.
         gamma: Discount of the MDP.

@@ -1,4 +1,4 @@
-"""pharos list: the environments, their parameters and named instances; or one of them, parameter by parameter."""
+"""pharos list: the environments, their parameters and named instances, or one of them, parameter by parameter."""
 
 import dataclasses
 import inspect
@@ -72,7 +72,7 @@ def _parameters(cls: type["Environment"]) -> dict[str, dict[str, Any]]:
 
 
 def rules_of(cls: type["Environment"]) -> list[tuple[str, str]]:
-    """(title, text) of each part of the docstring of a class before its attributes; a plain paragraph has no title.
+    """(title, text) of each part of the docstring of a class before its attributes. A plain paragraph has no title.
 
     An entry has its title in the first nine columns, `State    (row, column)`, and goes on in lines that are indented.
     """

@@ -47,7 +47,7 @@ def observations(
     Args:
         observation: Count only for this observation, or for your own. Repeatable.
         option: Option of the observations that you name.
-        budget: Seconds to bound what one observation costs; 0: do not.
+        budget: Seconds to bound what one observation costs. With 0 it is left out.
     """
     if option and not observation:
         raise ParameterError("--option goes with --observation NAME")
@@ -77,13 +77,13 @@ def observations(
 
 
 class _Price:
-    """Cost of observations for an agent without memory; the space is solved once, at the first query."""
+    """Cost of observations for an agent without memory. The space is solved once, at the first query."""
 
     def __init__(self, space: "StateSpace", gamma: float, chance: ChanceSetting, budget: float):
         self.space, self.gamma, self.chance, self.budget = space, gamma, chance, budget
 
     def of(self, classes: "np.ndarray | None", num_confused: int) -> dict[str, Any] | None:
-        """Bounds of the loss; None if not requested, if the space is too large, or with several frames."""
+        """Bounds of the loss. None if not requested, if the space is too large, or with several frames."""
         if num_confused == 0:
             return {"lower": 0.0, "upper": 0.0, "exact": True}
         if classes is None or self.budget <= 0 or self.gamma >= 1 or self.space.num_states > MOST_SOLVED:
@@ -107,7 +107,8 @@ def _entry(space: "StateSpace", name: str, options: dict[str, Any], price: _Pric
     """Counts and cost of one observation.
 
     Args:
-        strict: whether an observation that the environment does not have is an error; else it is said in the entry.
+        strict: whether an observation that the environment does not have is an error. Otherwise it is said in the
+            entry.
     """
     import numpy as np
 

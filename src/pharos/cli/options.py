@@ -85,7 +85,7 @@ def file_ending(*suffixes: str, help: str | None = None) -> ParameterInfo:
 
 
 def parse_parameters(words: list[str] | None) -> dict[str, Any]:
-    """`["height=12", "speeds=1,2"]` -> `{"height": 12, "speeds": (1, 2)}`; ParameterError: not name=value."""
+    """`["height=12", "speeds=1,2"]` -> `{"height": 12, "speeds": (1, 2)}`. ParameterError: not name=value."""
     parameters: dict[str, Any] = {}
     for word in words or ():
         name, sign, text = word.partition("=")
@@ -98,7 +98,8 @@ def parse_parameters(words: list[str] | None) -> dict[str, Any]:
 
 
 def parse_value(text: str) -> object:
-    """A value as Python or JSON writes it: 1, true, null, [[1,1],-1], (1,2), 1,2,3; lists become tuples; else text."""
+    """A value as Python or JSON writes it: 1, true, null, [[1,1],-1], (1,2), 1,2,3. Lists become tuples. Anything else
+    is text."""
     words = {"true": True, "false": False, "null": None, "none": None}
     if text.lower() in words:
         return words[text.lower()]
@@ -115,7 +116,7 @@ _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "KI": 2**10, "
 
 
 def parse_size(text: str | None, option: str = "--memory") -> int | None:
-    """`2GiB` -> 2147483648, `500MB` -> 500000000, `4096` -> 4096; ParameterError if it is no size."""
+    """`2GiB` -> 2147483648, `500MB` -> 500000000, `4096` -> 4096. ParameterError if it is no size."""
     if text is None:
         return None
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([KMGT]I?)?B?\s*", text.upper())
@@ -125,7 +126,7 @@ def parse_size(text: str | None, option: str = "--memory") -> int | None:
 
 
 def parse_seeds(text: str) -> list[int]:
-    """`0:64`, `0,1,5` or both, as a list; the end of a range does not belong to it.
+    """`0:64`, `0,1,5` or both, as a list. The end of a range does not belong to it.
 
     Raises:
         ParameterError: it is none of these, or has a seed twice.
@@ -144,7 +145,7 @@ def parse_seeds(text: str) -> list[int]:
 
 
 def total_of(mdp: "TabularMDP", gamma: float | None, horizon: int | None, objective: str | None) -> "TabularMDP":
-    """The MDP; with gamma 1 and no horizon if the objective is the total reward, or the reward of a step in the long
+    """The MDP, with gamma 1 and no horizon if the objective is the total reward, or the reward of a step in the long
     run."""
     if objective not in ("total", "average"):
         return mdp
@@ -158,14 +159,14 @@ def total_of(mdp: "TabularMDP", gamma: float | None, horizon: int | None, object
 
 
 def discount(gamma: float | None, horizon: int | None) -> float:
-    """The discount that `--gamma` names; 0.99 by default, or 1 with a horizon."""
+    """The discount that `--gamma` names. Default: 0.99, or 1 with a horizon."""
     if gamma is not None:
         return gamma
     return 0.99 if horizon is None else 1.0
 
 
 def ranks_of(processes: str) -> int | str:
-    """Return 1, or "mpi" in a process that a launcher has started with others; all but the first of them are silenced.
+    """Return 1, or "mpi" in a process that a launcher has started with others. All but the first of them are silenced.
 
     A number above 1 starts this command once more, by `mpiexec`.
     """
@@ -184,7 +185,7 @@ def ranks_of(processes: str) -> int | str:
 
 
 def check_format(path: Path, suffixes: Sequence[str], option: str = "--out") -> str:
-    """The suffix of `path`, lower case; ParameterError unless it is among `suffixes` and the folder above exists."""
+    """The suffix of `path`, lower case. ParameterError unless it is among `suffixes` and the folder above exists."""
     suffix = path.suffix.lower()
     if suffix not in suffixes:
         raise ParameterError(f"{option} {path}; expected a file name that ends in {' or '.join(suffixes)}")
@@ -221,10 +222,11 @@ class Building:
 
 @dataclass(frozen=True, kw_only=True)
 class SharedBuilding(Building):
-    """Options of building by several processes; made before any output, as all but the first then fall silent.
+    """Options of building by several processes, made before any output, as all but the first then fall silent.
 
     Attributes:
-        processes: processes that share the work and the memory, by MPI; under mpiexec: those that it has started.
+        processes: processes that share the work and the memory, by MPI. Under mpiexec, the processes that it has
+            started.
     """
 
     processes: Annotated[str, "N|mpi"] = "1"
@@ -234,7 +236,7 @@ class SharedBuilding(Building):
 
     @property
     def options(self) -> dict[str, Any]:
-        """Keywords of `build`; the memory is meant for one process."""
+        """Keywords of `build`. The memory is meant for one process."""
         size = parse_size(self.memory)
         if size is not None and self.processes.isdigit():
             size //= int(self.processes)
@@ -312,9 +314,9 @@ class Target:
         chance: ChanceSetting | None = None,
         by_range: bool = False,
     ) -> "TabularMDP":
-        """The tabular MDP, with chance; `gamma` None is 0.99, or 1 with a horizon.
+        """The tabular MDP, with chance. `gamma` None is 0.99, or 1 with a horizon.
 
-        by_range: whether rewards may wait until they are asked for; they do under MPI.
+        by_range: whether rewards may wait until they are asked for. They do under MPI.
         """
         chance = chance or ChanceSetting()
         if self.is_imported:
@@ -325,7 +327,7 @@ class Target:
         return chance.of(space.mdp(gamma=discount(gamma, horizon), by_range=by_range).with_horizon(horizon))
 
     def rewarded_space(self, building: Building | None = None) -> "StateSpace":
-        """The state space of an environment whose class pharos knows, and so its rewards; ParameterError else."""
+        """The state space of an environment whose class pharos knows, and so its rewards. ParameterError for others."""
         space = self.space(building)
         if space.environment is None:
             raise ParameterError(

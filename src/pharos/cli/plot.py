@@ -44,7 +44,7 @@ Picture = Annotated[Path, file_ending(".png", ".pdf", ".svg", help="FILE.png, FI
 
 @app.command()
 def regret(runs: Runs, *, out: Picture) -> Answer:
-    """Draw the regret of runs over their steps; runs that differ in the seed alone become one line with an interval."""
+    """Draw the regret of runs over their steps. Runs that differ in the seed alone become one line with an interval."""
     from pharos import plots
 
     return _saved(plots.regret(runs), out, {"runs": [str(folder) for folder in runs]})
@@ -67,7 +67,7 @@ def value(
 
     Args:
         policy: optimal, uniform, worst, FILE.npy, or the folder of a finished run.
-        fix: Draw the slice in which this variable has this value; start: all others as at the start of episodes.
+        fix: Draw the slice in which this variable has this value. start: all others as at the start of episodes.
         over: Two variables to draw over: down, and to the right.
     """
     down, comma, right = over.partition(",")
@@ -110,7 +110,7 @@ def plane(
     gamma: Gamma = None,
     budget: Annotated[float, typer.Option(min=0.1)] = 60.0,
 ) -> Answer:
-    """Draw instances by visitation and estimation complexity; a diameter known as an interval is a bar.
+    """Draw instances by visitation and estimation complexity. A diameter known as an interval is a bar.
 
     Args:
         visitation, estimation: Name of a measure.
@@ -201,7 +201,7 @@ def explore(
         policy: FILE.npy, or the folder of a finished run: shown beside optimal and uniform.
         gamma: Discount. Default: 0.99. Values have no horizon.
         out: Write one page with all its data to FILE.html, for up to 10,000 states.
-        port: Port of the local server; 0: any free one.
+        port: Port of the local server. 0 picks a free one.
         browser: Open the page in the browser.
     """
     from pharos.explorer import Explorer, write
@@ -254,7 +254,7 @@ def _learnt(policy: str | None, trust: bool) -> "Learnt | None":
 
 
 def _exploration(goal: Target, building: Building, **options: Any) -> "Exploration":
-    """Exploration of a target; `options` as for `exploration_of`."""
+    """Exploration of a target. `options` are the same as for `exploration_of`."""
     from pharos.explorer import exploration_of
 
     if goal.path is not None and (goal.path / "run.json").is_file():

@@ -52,7 +52,7 @@ def _state(row: dict[str, Any]) -> str:
 
 
 def readable_policy(mdp: "TabularMDP", policy: "np.ndarray", most: int, title: str = "policy") -> PolicyRows:
-    """The actions of a policy in states that it may reach, without terminal states; at most so many rows.
+    """The actions of a policy in states that it may reach, without terminal states, at most so many rows.
 
     Args:
         policy: (S,) actions, or (S, A + 1) by the previous action. With a horizon, it is the policy of the first step,

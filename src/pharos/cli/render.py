@@ -43,7 +43,7 @@ def render(
     fps: Annotated[float, typer.Option(min=0.1, max=50)] = 10.0,
     json: bool = False,
 ) -> Answer | None:
-    """Draw a state (PNG) or an episode (GIF, or the state after --steps as PNG); in the terminal without --out.
+    """Draw a state (PNG) or an episode (GIF, or the state after --steps as PNG), or in the terminal without --out.
 
     Args:
         observation: How to draw: human, text, simple_image, complex_image, or your own.
@@ -116,7 +116,7 @@ def _captions(env: "Environment", played: Sequence[tuple]) -> list[str]:
 
 
 def find_state(target: Target, env: "Environment", text: str | None) -> "State":
-    """The state that `--state` names: its number in the state space, or its values; by default the start state."""
+    """The state that `--state` names: its number in the state space, or its values. By default the start state."""
     from pharos.drawing import check_state
 
     if text is None:
@@ -134,7 +134,7 @@ def find_state(target: Target, env: "Environment", text: str | None) -> "State":
 def find_policy(
     target: Target, env: "Environment", name: str, gamma: float, seed: int
 ) -> tuple[str, Callable[["State"], int]]:
-    """The name and the function of a policy; "auto" is optimal if the state space is small, else uniform."""
+    """The name and the function of a policy. "auto" is optimal if the state space is small, else uniform."""
     if name == "auto":
         try:
             return "optimal", _optimal(target, gamma, AUTOMATIC_STATES)
@@ -161,12 +161,12 @@ def _optimal(target: Target, gamma: float, max_states: int | None) -> Callable[[
 
 
 ESCAPES = {"[A": "up", "[B": "down", "[C": "right", "[D": "left", "OA": "up", "OB": "down", "OC": "right", "OD": "left"}
-SIGNS = {"up": "↑", "left": "←", "down": "↓", "right": "→", "space": "space"}
+KEY_SIGNS = {"up": "↑", "left": "←", "down": "↓", "right": "→", "space": "space"}
 QUIT, NEW_GAME, UNDO = "q", "r", "u"
 
 
 def play(target: Target, *, state: str | None = None, seed: Seed | None = None) -> Answer:
-    """Play with the keyboard, in the terminal; one key is one step.
+    """Play with the keyboard, in the terminal. One key is one step.
 
     Args:
         state: Number of a state, or its values 2,3,1. Default: the start.
@@ -215,7 +215,7 @@ class Game:
         return bool(self.env.is_terminal(self.state))
 
     def press(self, key: str) -> None:
-        """Execute the command of a key: an action, AGAIN (restart), BACK (undo one step); other keys do nothing."""
+        """Execute the command of a key: an action, AGAIN (restart), BACK (undo one step). Other keys do nothing."""
         if key == NEW_GAME:
             self.state, self.history = self.start, []
         elif key == UNDO and self.history:
@@ -245,7 +245,7 @@ def _picture(game: Game) -> "RenderableType":
         line.append("   the episode has ended", style="bold yellow")
     names: dict[int, list[str]] = {}
     for key, action in game.keys.items():
-        names.setdefault(action, []).append(SIGNS.get(key, key))
+        names.setdefault(action, []).append(KEY_SIGNS.get(key, key))
     does = [f"{'/'.join(sorted(shown, key=len))} {game.env.actions[action]}" for action, shown in names.items()]
     help_line = Text("   ".join([*does, f"{UNDO} undo", f"{NEW_GAME} restart", f"{QUIT} quit"]), style="dim")
     return Group(line, Text(), colored_text(game.env, game.state), Text(), help_line)
@@ -253,7 +253,7 @@ def _picture(game: Game) -> "RenderableType":
 
 @contextlib.contextmanager
 def _screen() -> Iterator:
-    """Yield a function that draws on the alternate screen of the terminal; the main screen is restored at the end."""
+    """Yield a function that draws on the alternate screen of the terminal. The main screen is restored at the end."""
     to = console(stderr=True)
     with to.screen(hide_cursor=True) as screen:
         yield screen.update
@@ -261,7 +261,7 @@ def _screen() -> Iterator:
 
 @contextlib.contextmanager
 def _keys() -> Iterator:
-    """Yield a function that waits for a key and returns its name; the terminal is restored in any case."""
+    """Yield a function that waits for a key and returns its name. The terminal is restored in any case."""
     import termios
     import tty
 

@@ -114,7 +114,7 @@ def run(
         shards: With --on slurm: jobs of the array. Default: 8.
         slurm: With --on slurm: timeout_min=600, slurm_partition=cpu, ...
         address: With --on ray: address of the cluster. Default: start one.
-        log: Write curves as runs finish; see `study log`.
+        log: Write curves as runs finish, see `study log`.
     """
     from pharos import study
 
@@ -137,7 +137,7 @@ def run(
             end = study.run_on_ray(opened, directory, address=address, progress=report, **options)
         else:
             try:
-                end = study.run(opened, directory, foretold=_say, progress=report, **options)
+                end = study.run(opened, directory, on_forecast=_print_forecast, progress=report, **options)
             except AllRunsFailed as error:  # the answer says of each why
                 end = error.outcome
     if logs is not None:
@@ -145,7 +145,7 @@ def run(
     return _answer(end, failed=bool(end.failed))
 
 
-def _say(forecast: object) -> None:
+def _print_forecast(forecast: object) -> None:
     """Print the forecast of the duration on standard error."""
     console(stderr=True).print(str(forecast), soft_wrap=True)
 
@@ -229,7 +229,7 @@ def predict(
     observation: list[str] | None = None,
     primary: bool = False,
 ) -> Answer:
-    """Predict the regret of each cell from what its network makes of its states, before any run; hashed and dated.
+    """Predict the regret of each cell from what its network makes of its states, before any run, hashed and dated.
 
     Args:
         out: Write to this Parquet file.
@@ -268,7 +268,7 @@ def predict(
 
 @app.command("pack")
 def pack(source: Results, *, to: Annotated[Path, "FILE"]) -> Answer:
-    """Put the finished runs into one Parquet file, to keep, publish or carry; without what the agents learnt.
+    """Put the finished runs into one Parquet file, to keep, publish or carry, without what the agents learnt.
 
     Args:
         to: Write to this Parquet file.
@@ -287,7 +287,7 @@ def unpack(
     out: Annotated[Path | None, "DIR"] = None,
     trust: Trust = False,
 ) -> Answer:
-    """Put packed runs into a study's folder; `pharos study run FOLDER` goes on with those that are missing.
+    """Put packed runs into a study's folder. `pharos study run FOLDER` goes on with those that are missing.
 
     Args:
         file: File from `pharos study pack`.
@@ -320,7 +320,7 @@ def _answer(status: "Status", failed: bool = False) -> Answer:
 
 @contextlib.contextmanager
 def _progress(logs: "RunLog | None") -> "Iterator[Callable[[Status], None]]":
-    """A bar on a terminal, elsewhere a line on standard error every LINE_SECONDS; as often curves are written."""
+    """A bar on a terminal, elsewhere a line on standard error every LINE_SECONDS. As often curves are written."""
     with progress_bar("runs", 1) as show:
         latest = time.monotonic()
 

@@ -50,15 +50,15 @@ def train(
 
     Args:
         seed: Seed of everything random.
-        seeds: Train a run for each of these seeds, such as 0:64; --out has a folder for each.
+        seeds: Train a run for each of these seeds, such as 0:64. --out has a folder for each.
         device: Device of the batched engine: cpu or cuda.
-        out: Write results to this folder; an unfinished run in it resumes.
+        out: Write results to this folder. An unfinished run in it resumes.
         table: YAML file of hyperparameters, such as `pharos tune` writes.
         workers: Number of processes for many seeds. Default: as many as processors.
         gamma: Discount of values and returns. Default: 1, with a horizon.
         horizon: Steps of an episode. Default: the environment's time limit.
         endless: Use discounted values without a horizon, at --gamma (0.99).
-        objective: total: gamma 1 and no horizon; average: also measure the reward of a step in the long run.
+        objective: total: gamma 1 and no horizon. average: also measure the reward of a step in the long run.
         tensorboard: Write TensorBoard logs into --out.
     """
     env = target.found_environment()
@@ -106,7 +106,7 @@ def train(
 
 
 def _train_many(title: str, *, seeds: list[int], steps: int, out: Path | None, **setting: Any) -> Answer:
-    """Train one run per seed; answers with quartiles over the runs, and with errors of failed runs."""
+    """Train one run per seed. Answers with quartiles over the runs, and with errors of failed runs."""
     from pharos.training import FailedRun, train_many
 
     began = time.perf_counter()
@@ -146,7 +146,7 @@ def _is_uniform_optimal(result: Mapping[str, Any]) -> bool:
 
 
 def _quartiles(values: list[float | None]) -> list[float] | None:
-    """Lower quartile, median, upper quartile; None if there is no number."""
+    """Lower quartile, median, upper quartile. None if there is no number."""
     import numpy as np
 
     numbers = [value for value in values if value is not None and math.isfinite(value)]
@@ -278,15 +278,15 @@ def tune(
         targets: Instances of one class, such as frozen_lake/4x4 frozen_lake/8x8.
         trials: Number of trials, with earlier ones in --out.
         steps: Training steps of every run.
-        seeds: Seeds of the runs of a trial; do not use the seeds of your experiment.
+        seeds: Seeds of the runs of a trial. Do not use the seeds of your experiment.
         search: Search this instead of the agent's space: learning_rate=log,0.0001,0.01, gamma=linear,0.9,1,
             batch_size=32,64. Repeatable.
         search_seed: Seed of the search.
-        engine: sb3; or batched: all runs of a trial that fit together as one program.
-        out: Write the YAML file and the record to this folder; a search in it resumes.
+        engine: sb3, or batched: all runs of a trial that fit together as one program.
+        out: Write the YAML file and the record to this folder. A search in it resumes.
         chance: Train under this kind of chance, on every instance: --chance plain --chance random=0.1 --chance
             sticky=0.25.
-        shortlist_by_prediction: Proposals for each trial; only the one with the least predicted regret is run. For dqn
+        shortlist_by_prediction: Proposals for each trial. Only the one with the least predicted regret is run. For dqn
             and ppo.
     """
     instances = [Target(target).found_environment() for target in targets]
@@ -335,7 +335,7 @@ def tune(
 
 
 def _chances(words: list[str] | None) -> list[dict[str, float]] | None:
-    """`["plain", "random=0.1"]` -> `[{}, {"random": 0.1}]`; None if nothing is said."""
+    """`["plain", "random=0.1"]` -> `[{}, {"random": 0.1}]`, or None if nothing is said."""
     if not words:
         return None
     try:
@@ -350,7 +350,7 @@ def _chances(words: list[str] | None) -> list[dict[str, float]] | None:
 
 
 def _space(words: list[str] | None) -> dict[str, tuple[Any, ...]] | None:
-    """`["batch_size=32,64"]` -> `{"batch_size": ("one of", 32, 64)}`; None if nothing is said."""
+    """`["batch_size=32,64"]` -> `{"batch_size": ("one of", 32, 64)}`, or None if nothing is said."""
     if not words:
         return None
     space = {}

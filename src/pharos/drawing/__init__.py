@@ -1,4 +1,4 @@
-"""Pixels and text from the layers and the look that an environment declares; knows no class.
+"""Pixels and text from the layers and the look that an environment declares. It knows no class.
 
 A file is loaded when something in it is first used.
 """

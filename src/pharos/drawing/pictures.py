@@ -110,7 +110,7 @@ def human(env: Environment, state: Sequence[int], *, cell: int | None = None) ->
 
     Args:
         state: D integers.
-        cell: pixels of a cell; None for as many as fit into a picture of 960 x 720.
+        cell: pixels of a cell. Default: as many as fit into a picture of 960 x 720.
     """
     planes = planes_of(env, state)
     if (own := env.picture(state)) is not None:
@@ -155,7 +155,7 @@ def image(picture: np.ndarray, caption: str = "") -> "Image":
 
 
 def save_png(path: str | os.PathLike, picture: np.ndarray, *, caption: str = "", at_least: int = 0) -> Path:
-    """Write a picture as PNG; small ones are enlarged by a whole factor to `at_least` pixels on their longer side."""
+    """Write a picture as PNG. Small ones are enlarged by a whole factor to `at_least` pixels on their longer side."""
     path = Path(path)
     with storage.replacing(path, follow=True) as file:
         image(enlarged(picture, at_least), caption).save(file, format="PNG", optimize=True)
@@ -196,7 +196,7 @@ def enlarged(picture: np.ndarray, at_least: int) -> np.ndarray:
 
 
 def fitting_cell(rows: int, columns: int, height: int, width: int) -> int:
-    """Pixels of a cell, the most with which a grid and its margins fit; CELL_SIZES[0] if none does."""
+    """Pixels of a cell, the most with which a grid and its margins fit, CELL_SIZES[0] if none does."""
     fits = [cell for cell in CELL_SIZES if (rows + 1) * cell <= height and (columns + 1) * cell <= width]
     return fits[-1] if fits else CELL_SIZES[0]
 
@@ -209,9 +209,9 @@ Policy = Callable[[State], int]
 def episode(
     env: Environment, policy: Policy, start: Sequence[int], *, steps: int, seed: int = 0
 ) -> list[tuple[State, int, float]]:
-    """Play from `start`: (state, action, reward) for each step, then (last state, -1, 0.0); at most `steps` steps.
+    """Play from `start`: (state, action, reward) for each step, then (last state, -1, 0.0), for at most `steps` steps.
 
-    `seed` is of the chance in the rules; without chance nothing is drawn.
+    `seed` is of the chance in the rules. Without chance nothing is drawn.
 
     The rules run interpreted: a few microseconds to a millisecond a step.
     """
@@ -234,7 +234,7 @@ def episode(
 
 
 def ground_of(ground: str | Ground) -> Ground:
-    """The function that paints a ground; UnknownName if GROUNDS has none of this name."""
+    """The function that paints a ground. UnknownName if GROUNDS has none of this name."""
     if not isinstance(ground, str):
         return ground
     if ground not in GROUNDS:
@@ -248,7 +248,7 @@ def scenery_of(env: Environment) -> Scenery:
 
 
 def without_margin(picture: np.ndarray, margin: Margin) -> np.ndarray:
-    """The part of a picture that its cells fill; a view."""
+    """The part of a picture that its cells fill, as a view."""
     top, right, bottom, left = margin
     return picture[top : len(picture) - bottom, left : picture.shape[1] - right]
 
@@ -264,7 +264,7 @@ def _plain(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None:
 
 
 def _road(picture: np.ndarray, cell: tuple[int, int], margin: Margin) -> None:
-    """Asphalt, with dashes between the lanes; the first and the last row are pavements."""
+    """Asphalt, with dashes between the lanes. The first and the last row are pavements."""
     court, side = without_margin(picture, margin), cell[0]
     court[:] = (52, 54, 60)
     thickness = max(1, side // 16)
@@ -347,7 +347,7 @@ GROUNDS: dict[str, Ground] = {
 
 
 class Window:
-    """Shows pictures, one after the other, `fps` a second at most; opens with the first.
+    """Shows pictures, one after the other, `fps` a second at most. Opens with the first.
 
     Raises:
         MissingExtra: pygame is not installed.
@@ -375,7 +375,7 @@ class Window:
         self._clock.tick(self._fps)
 
     def close(self) -> None:
-        """Close it; the next picture opens another."""
+        """Close it. The next picture opens another."""
         if self._surface is not None:
             self._pygame.display.quit()
             self._surface = None

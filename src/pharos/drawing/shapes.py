@@ -38,7 +38,7 @@ def shape_of(name: str, layer: Layer) -> Shape:
 
 
 def color_of(layer: Layer, value: int) -> Color:
-    """The colour of value 1, 2, ... of a layer; of a higher value than it has colours, the last."""
+    """The colour of value 1, 2, ... of a layer. For a higher value than it has colours, the last."""
     colors: Any = layer.color
     return _of_value(colors, value) if np.ndim(colors) == 2 else colors
 
@@ -148,7 +148,7 @@ def _cover(distance: np.ndarray, radius: float, cell: int) -> np.ndarray:
 
 
 def _bar(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
-    """A slab in the upper half of the cell; neighbours join."""
+    """A slab in the upper half of the cell. Neighbours join."""
     tile = np.zeros((cell, cell, 4))
     height, edge = max(3, cell * 7 // 16), max(1, cell // 12)
     tile[:height, :, :3], tile[:height, :, 3] = color, 1.0
@@ -158,7 +158,7 @@ def _bar(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
 
 
 def _car(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
-    """A car from above, with its lights on; it goes left if its glyph is "<"."""
+    """A car from above, with its lights on. It goes left if its glyph is "<"."""
     fine = 4
     y, x = _grid(fine * cell)
     if glyph == "<":
@@ -191,7 +191,7 @@ def _lettered(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
 
 
 def _power(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
-    """A block with a power of two, whose exponent in base 36 is the glyph; with the glyph if the cell is small."""
+    """A block with a power of two, whose exponent in base 36 is the glyph. With the glyph if the cell is small."""
     number = str(2 ** int(glyph, 36))
     return _written(color, cell, number if 4 * len(number) < cell else glyph)
 

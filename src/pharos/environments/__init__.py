@@ -1,6 +1,6 @@
 """Environments: the contract of a class (`Environment`, `Layer`), the built-in classes, the catalogue of names.
 
-`import pharos` needs the names of the built-in classes alone; a file is loaded when something in it is first used.
+`import pharos` needs the names of the built-in classes alone. A file is loaded when something in it is first used.
 BUILT_IN lists the classes, such as `environments.Breakout`.
 """
 

@@ -43,7 +43,7 @@ class Kind:
 
     Attributes:
         text: how a value is written on the command line, such as "row,column".
-        checked: function(environment, name of the parameter, value) -> the value as it is stored; raises
+        checked: function(environment, name of the parameter, value) -> the value as it is stored. It raises
             ParameterError.
     """
 
@@ -64,7 +64,7 @@ class Parameter:
 
     Attributes:
         kind: int, float, bool, or a Kind.
-        low, high: of numbers; constants, or functions of the environment.
+        low, high: of numbers: constants, or functions of the environment.
         optional: whether None is a value too.
         added: whether the class got it when instances were already stored by their parameters. If it has its default,
             it is not among `Environment.parameters`, so that these stay as they were.
@@ -95,7 +95,7 @@ class Parameter:
         return name + (f" >= {low:g}" if low is not None else f" <= {high:g}" if high is not None else "")
 
     def checked(self, env: object, name: str, value: object) -> object:
-        """The value converted to its stored form; ParameterError if it is out of range."""
+        """The value converted to its stored form. ParameterError if it is out of range."""
         if value is None and self.optional:
             return None
         low, high = (bound(env) if callable(bound) else bound for bound in (self.low, self.high))
@@ -115,9 +115,9 @@ def parameter(
     """A field of an environment's dataclass, with the values that it may take.
 
     Args:
-        default: the value when none is given; None as a default is a value that is not checked.
-        low, high: bounds of a number; functions of the environment if they depend on other parameters.
-        kind: int, float, bool, or a Kind; None: the type of the default.
+        default: the value if none is passed. None as a default is not checked.
+        low, high: bounds of a number, or functions of the environment if they depend on other parameters.
+        kind: int, float, bool, or a Kind. Default: the type of the default.
         added: True for a parameter that a class gets when there are results of it already. If it has its default,
             what was stored before, such as built state spaces, is found again.
     """
@@ -136,7 +136,7 @@ def declared_parameters(cls: type) -> dict[str, Parameter]:
 
 
 def check_parameters(env: object) -> None:
-    """Check and store the parameters of an environment being made; ParameterError names the first wrong one."""
+    """Check and store the parameters of an environment being made. ParameterError names the first wrong one."""
     declared = declared_parameters(type(env))
     for name in sorted(declared, key=lambda name: declared[name].is_bounded_by_others):
         store(env, name, declared[name].checked(env, name, getattr(env, name)))
@@ -307,13 +307,13 @@ Shape = Callable[[np.ndarray, int, str], np.ndarray]
 
 @dataclass(frozen=True)
 class Layer:
-    """Appearance of one kind of thing. `draw` puts it on its plane; every picture is made from the planes.
+    """Appearance of one kind of thing. `draw` puts it on its plane. Every picture is made from the planes.
 
     Attributes:
-        glyph: one character for text drawings; several, one for each value 1, 2, ... on the plane.
-        color: (red, green, blue), 0 to 255; or several, one for each value on the plane.
-        sprite: rows of text: '#' is the colour, '.' lets the ground show through; digits 1-9
-            pick shades from light to dark; several sprites, one for each value on the plane. None draws a full cell.
+        glyph: one character for text drawings, or several, one for each value 1, 2, ... on the plane.
+        color: (red, green, blue), 0 to 255, or several, one for each value on the plane.
+        sprite: rows of text: '#' is the colour, '.' lets the ground show through, digits 1-9 pick shades from light to
+            dark. Several sprites stand for the values on the plane. None draws a full cell.
         shape: how pictures for people draw it, in place of the sprite: a name in `pharos.drawing.SHAPES`, or a function
             (see `Shape`). None: the sprite, or else the shape that is called like the layer ("ball", "agent", "holes",
             "goal", "paddle"), or else a block.
@@ -350,8 +350,8 @@ class Look:
 
     Attributes:
         ground: of pictures for people: a name in `pharos.drawing.GROUNDS`, or a function (see `Ground`).
-        scenery: of complex images; None: square cells on `ground`, with the sprites and shapes of the layers.
-        color: of the class in plots, such as "#0072B2"; None: one that no other class has.
+        scenery: of complex images. Default: square cells on `ground`, with the sprites and shapes of the layers.
+        color: of the class in plots, such as "#0072B2". Default: one that no other class has.
     """
 
     ground: str | Ground = "plain"
@@ -370,7 +370,7 @@ class Components:
     Attributes:
         names: D names, such as `row` or `bricks[0,3]`.
         variables: name of a variable -> slice of the state vector.
-        low, size: (D,) int64; component i takes the values low[i], ..., low[i] + size[i] - 1.
+        low, size: (D,) int64. Component i takes the values low[i], ..., low[i] + size[i] - 1.
     """
 
     names: tuple[str, ...]
@@ -398,7 +398,7 @@ class Environment:
         version: int                raised when a transition or reward changes, never for a refactoring
         max_episode_steps: int      the time limit that the Gymnasium environments use unless told otherwise;
                                     an attribute or a property
-        layers: dict[str, Layer]    how each plane of `draw` looks; later layers cover earlier ones
+        layers: dict[str, Layer]    how each plane of `draw` looks. Later layers cover earlier ones
 
     Class attributes that may be left out
         look: Look                  the ground below the layers, the screen of complex images, the colour in plots
@@ -553,7 +553,7 @@ class Environment:
         raise NotImplementedError(f"{type(self).__name__} must define draw() to be drawn")
 
     def picture(self, state) -> np.ndarray | None:
-        """A picture of `state` for people, (H, W, 3) uint8, in place of the drawing; here None: there is no other."""
+        """A picture of `state` for people, (H, W, 3) uint8, in place of the drawing. Here None: there is no other."""
         return None
 
     def draw_motion(self, state, planes) -> None:
@@ -561,7 +561,7 @@ class Environment:
 
     @property
     def recorded(self) -> "np.ndarray | DistinctRows | None":
-        """(states, ...) recorded observation of each state, for the observation "recorded"; the base class has None."""
+        """(states, ...) recorded observation of each state, for the observation "recorded". The base class has None."""
         return None
 
     @property
@@ -618,7 +618,7 @@ class Environment:
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """The parameters of this instance, in the order of the dataclass; JSON-able.
+        """The parameters of this instance, in the order of the dataclass, JSON-able.
 
         Without those that were `added` to the class and have their default: see `parameter`.
         """
@@ -739,7 +739,7 @@ def _guarded(name: str, arguments: int, rule: Any, acting: Any) -> Any:
 
 @cache
 def num_arguments(rule: Callable[..., object]) -> int:
-    """Number of positional arguments of a rule, `self` among them; 0 if Python cannot tell."""
+    """Number of positional arguments of a rule, `self` among them. 0 if Python does not say."""
     try:
         parameters = inspect.signature(rule).parameters.values()
     except (TypeError, ValueError):
@@ -748,7 +748,7 @@ def num_arguments(rule: Callable[..., object]) -> int:
 
 
 def start_distribution(env: Environment) -> tuple[list[State], np.ndarray]:
-    """The start states, each once, and their probabilities; ParameterError if they are not a distribution."""
+    """The start states, each once, and their probabilities. ParameterError if they are not a distribution."""
     merged: dict[State, float] = {}
     components = env.components
     for state, probability in env.initial_states():

@@ -1,7 +1,7 @@
 """The built-in environments, by name: enough to list them and to register them with Gymnasium without loading them.
 
-BUILT_IN is the only list of environments. Everything else about a class stands in its own file; what is said of it here
-is compared with the class by a test, which prints the entry that it expects.
+BUILT_IN is the only list of environments. Everything else about a class stands in its own file. A test compares what is
+said of it here with the class, and prints the entry that it expects.
 """
 
 from collections.abc import Callable
@@ -90,7 +90,7 @@ _CALLBACKS: list[Callable[[type["Environment"]], None]] = []
 
 
 def on_registration(callback: Callable[[type["Environment"]], None]) -> None:
-    """Call `hear` with every user class that is registered from now on."""
+    """Call `callback` with every user class that is registered from now on."""
     _CALLBACKS.append(callback)
 
 

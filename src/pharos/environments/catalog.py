@@ -33,9 +33,9 @@ def make(name: str, **parameters: object) -> Environment:
         name: a class (`"breakout"`), a named instance (`"breakout/12x10x1"`, see `list_environments`), a folder with an
             imported MDP, or where your own class is (`"my_module:MyClass"`, `"folder/my_file.py:MyClass"`), which
             registers it.
-        parameters: of the class; they override the parameters of a named instance.
+        parameters: of the class. They override the parameters of a named instance.
     Raises:
-        UnknownName: no such environment or parameter; the nearest name is suggested.
+        UnknownName: no such environment or parameter. The nearest name is suggested.
         ParameterError: a parameter is out of range, there is no such module or class, or `name` is no text.
     """
     if not isinstance(name, str):
@@ -75,7 +75,7 @@ def list_environments() -> list[str]:
 
 
 def class_called(name: str) -> type[Environment] | None:
-    """The class with this name; None if there is none."""
+    """The class with this name, or None if there is none."""
     return _built_in(name) if name in _OWN else _REGISTERED.get(name)
 
 
@@ -98,8 +98,8 @@ def named_instances() -> dict[str, tuple[str, Mapping[str, Any]]]:
 
 
 def instance_name(environment: str, parameters: Mapping[str, object]) -> str:
-    """Name of an instance with these parameters, such as `frozen_lake/8x8`; else the class and parameters that differ
-    from its defaults (if the class is not loaded or has no defaults: all that are neither None nor empty).
+    """Name of an instance with these parameters, such as `frozen_lake/8x8`. If there is none, the class and parameters
+    that differ from its defaults (if the class is not loaded or has no defaults: all that are neither None nor empty).
     """
     cls, setting = class_called(environment), {name: as_tuples(value) for name, value in parameters.items()}
     usual: Mapping[str, object] = {name: value for name, value in setting.items() if value in (None, ())}
@@ -116,16 +116,16 @@ def import_class(path: str, folder: str | os.PathLike | None = None) -> type[Env
     """Import a user's class from "module:Class" or "file.py:Class", register it and return it.
 
     Args:
-        folder: relative files and modules are looked for there first; None: in the current directory.
+        folder: relative files and modules are looked for there first. Default: the current directory.
     Raises:
-        ParameterError: no such module, file or class; or one that `register` refuses.
+        ParameterError: no such module, file or class, or one that `register` refuses.
     """
     source = sources.find_source(path, None if folder is None else Path(folder))
     return _known_class(source, sources.load_source(source))
 
 
 def class_of(source: Source, *, trust: bool = False, strict: bool = False) -> type[Environment]:
-    """The class that a stored configuration names; registered, so that `make` knows it.
+    """The class that a stored configuration names, registered, so that `make` knows it.
 
     Args:
         trust, strict: as for `pharos.system.sources.resolve`.
@@ -136,7 +136,7 @@ def class_of(source: Source, *, trust: bool = False, strict: bool = False) -> ty
 
 
 def class_source(cls: type[Environment]) -> Source | None:
-    """Module or file of a user's class; None for built-in classes, and for those that no other process can import."""
+    """Module or file of a user's class. None for built-in classes, and for those that no other process can import."""
     return None if _is_built_in(cls) else sources.source_of(cls)
 
 

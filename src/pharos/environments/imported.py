@@ -36,9 +36,9 @@ DIGIT_SPRITES = (
 class ImportedWorld(Environment):
     """The MDP of a folder that `pharos import` or `importers.save` wrote.
 
-    State    its number in the folder; S is the end, if transitions end an episode without a next state.
-    Actions  as in the source; by name if the import recorded the names, otherwise by number.
-    Reward   of the outcome, if the folder has it; otherwise the mean for the state and action.
+    State    its number in the folder. S is the end, if transitions end an episode without a next state.
+    Actions  as in the source: by name if the import recorded the names, otherwise by number.
+    Reward   of the outcome, if the folder has it, otherwise the mean for the state and action.
     Ends     in terminal states, and on transitions without a next state.
     Chance   as in the table.
     """
@@ -85,7 +85,7 @@ class ImportedWorld(Environment):
 
     @property
     def max_episode_steps(self) -> int:  # type: ignore[override]
-        """The horizon of the MDP; else the time limit of its source; else 1,000."""
+        """The horizon of the MDP, else the time limit of its source, else 1,000."""
         return int(self.manifest.get("horizon") or self.manifest.get("time_limit") or TIME_LIMIT)
 
     @cached_property
@@ -142,7 +142,7 @@ class ImportedWorld(Environment):
             rest = rest // 10
 
     def picture(self, state) -> np.ndarray | None:
-        """Picture of a state from the source, (H, W, 3) uint8, if the import recorded images or grids; else None.
+        """Picture of a state from the source, (H, W, 3) uint8, if the import recorded images or grids, else None.
 
         Codes of a grid are shown as colours.
         """
@@ -163,7 +163,7 @@ class ImportedWorld(Environment):
 
     @property
     def successors(self) -> np.ndarray:
-        """(S, A, K) int64, next states; with a row for the end, if there is one."""
+        """(S, A, K) int64, next states, with a row for the end, if there is one."""
         return self._table[0]
 
     @property
@@ -187,20 +187,20 @@ class ImportedWorld(Environment):
 
     @cached_property
     def available(self) -> np.ndarray:
-        """(S, A) bool, the actions that exist in each state; (1, A), all True, if every action exists everywhere."""
+        """(S, A) bool, the actions that exist in each state. (1, A), all True, if every action exists everywhere."""
         if not self.has_sets:
             return np.ones((len(self.successors), self.manifest["num_actions"]), np.bool_)
         return self._with_end(np.asarray(self._arrays[mdp_files.AVAILABLE], np.bool_), True)
 
     @property
     def paid(self) -> np.ndarray:
-        """(S, A, K) float64, the reward of each outcome; (S, A, 1) if the folder has only the means."""
+        """(S, A, K) float64, the reward of each outcome. (S, A, 1) if the folder has only the means."""
         paid = self._table[2]
         return self.rewards[:, :, None] if paid is None else paid
 
     @cached_property
     def recorded(self) -> np.ndarray | DistinctRows | None:  # type: ignore[override]
-        """(S, ...) recorded observation of each state, zeros for the end; None if the import recorded nothing.
+        """(S, ...) recorded observation of each state, zeros for the end. None if the import recorded nothing.
 
         Rows of a large recording are read when they are looked at.
         """
@@ -286,9 +286,9 @@ def written_out(
     actions: int,
     outcome_rewards: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-    """(S, A, K) successors, probabilities that sum to 1, and rewards; impossible outcomes are left out.
+    """(S, A, K) successors, probabilities that sum to 1, and rewards. Impossible outcomes are left out.
 
-    S is the end, if there is one. p (N,): probabilities; outcome_rewards (N,): the reward of each outcome, if known.
+    S is the end, if there is one. p (N,): probabilities. outcome_rewards (N,): the reward of each outcome, if known.
 
     Raises:
         ParameterError: they are more than MOST_ENTRIES numbers. ValueError: they are no table of an MDP.

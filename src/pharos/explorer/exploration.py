@@ -1,7 +1,7 @@
 """Data of a page about an MDP: states with their values, gaps and successors, paths, layers, maps.
 
-Answers are plain dictionaries, ready for JSON; numbers that JSON cannot say are None. A position is a state and, under
-sticky actions, the action executed before; there is none before the first step.
+Answers are plain dictionaries, ready for JSON. Numbers that JSON cannot say are None. A position is a state and, under
+sticky actions, the action executed before. There is none before the first step.
 
 How often policies are in states, and what they lose there.
 
@@ -34,7 +34,7 @@ from pharos.explorer.states import (
     States,
     probabilities,
 )
-from pharos.hardness import discounted_visits, occupancy
+from pharos.hardness import ERRORS_PER_TIE, discounted_visits, occupancy
 from pharos.mdp import TabularMDP, names_of, uniform_choice
 from pharos.observations import num_values
 from pharos.policies import state_losses
@@ -60,7 +60,7 @@ class DiscountedVisits:
         return visits[:, None] * (np.eye(mdp.num_actions)[table] if table.ndim == 1 else table)
 
     def of(self, policy: str) -> np.ndarray:
-        """(S,) visits of states; kept for the next time."""
+        """(S,) visits of states, kept for the next time."""
         if policy not in self._known:
             self._known[policy] = discounted_visits(self.exploration.mdp, self._table(policy))[0]
         return self._known[policy]
@@ -74,7 +74,7 @@ class DiscountedVisits:
         return state_losses(world.solutions[OPTIMAL], pairs, first), pairs.sum(axis=1), pairs.argmax(axis=1)
 
     def _table(self, policy: str) -> np.ndarray | None:
-        """The policy as solvers take it; None for the uniform one. Uniform in states in which it was not asked."""
+        """The policy as solvers take it, or None for the uniform one. Uniform in states in which it was not asked."""
         if policy == UNIFORM:
             return None
         table = np.asarray(self.exploration.solutions[policy].policy)
@@ -87,7 +87,6 @@ LONGEST_PATH = 2_000  # steps that are shown
 MOST_LISTED_STARTS = 100  # start states that are listed
 LISTED = 48  # states of a layer that are listed at a time
 MOST_WORST_STATES = 24  # states that are listed where a policy goes wrong
-ERRORS_PER_TIE = 2.5  # the gap of a tie is at most this times the bound on errors of values, see hardness.gaps
 
 
 class Exploration:
@@ -158,7 +157,7 @@ class Exploration:
         return self.mdp.chance.at(states).chosen_values(executed, self._before(states, previous))
 
     def chances(self, name: str, states: np.ndarray, q: np.ndarray, previous: int | None = None) -> np.ndarray:
-        """(N, A) how often a policy chooses each action; `q`: optimal values of choosing, for the optimal one."""
+        """(N, A) how often a policy chooses each action. `q`: optimal values of choosing, for the optimal one."""
         if name == UNIFORM:
             return uniform_choice(self.mdp)[states]
         if name == LEARNT:
@@ -190,14 +189,24 @@ class Exploration:
 
         Args:
             state: its number.
-            previous: the action executed before, under sticky actions; None: there was none.
+            previous: the action executed before, under sticky actions. None: there was none.
         Returns:
-            state, previous, values (of its variables), labels, terminal, layer, start (probability that an episode
-            starts there), v (policy -> value), the drawing as `Pictures.of` has it, and for each action: `name`, if
-            actions have other names in other states, else None; `q` and `gap`, of choosing it; `available`, whether it
-            is; `best`, whether the gap is a tie; of each policy, `policies` (how often it chooses it) and `q_of` (the
-            value of choosing it, and following the policy afterwards); `reward`, expected; `outcomes`: a list of state
-            (None for the end), previous action, probability, reward.
+            Entries of the position:
+
+            - state, previous, values (of its variables), labels, terminal, layer
+            - start: probability that an episode starts there
+            - v: policy -> value
+            - the drawing, as `Pictures.of` has it
+
+            Of each action:
+
+            - `name`: if actions have other names in other states, else None
+            - `q` and `gap`: of choosing it
+            - `available`: whether it is. `best`: whether the gap is a tie
+            - `policies`: how often each policy chooses it
+            - `q_of`: the value of choosing it, and following the policy afterwards, of each policy
+            - `reward`: expected
+            - `outcomes`: a list of state (None for the end), previous action, probability, reward
         Raises:
             ParameterError: there is no such state or action.
         """
@@ -250,7 +259,7 @@ class Exploration:
         return self.mdp.chance.at(here).weights(choices, self._before(choices, previous))
 
     def _outcomes(self, state: int, executed: np.ndarray) -> list[list[Any]]:
-        """(state, previous, probability, reward) of possible outcomes, likeliest first; executed: (A,) chances."""
+        """(state, previous, probability, reward) of possible outcomes, likeliest first. executed: (A,) chances."""
         merged: dict[tuple[int | None, int | None, float], float] = {}
         for action in np.flatnonzero(executed).tolist():
             for after, probability, reward in self._of_executing(state, action):
@@ -290,7 +299,7 @@ class Exploration:
         return self._variables_of(state) if self.space is not None else (state,)
 
     def _number_of(self, state: State) -> int | None:
-        """The number of a state of the environment; None: the end."""
+        """The number of a state of the environment. None: the end."""
         if self.space is not None:
             return self.states.number(state)
         return int(state[0]) if state[0] < self.mdp.num_states else None
@@ -321,9 +330,9 @@ class Exploration:
         the way, until the end, or until nothing new is left.
 
         Returns:
-            `steps`, a list of state, previous, action, probability (of the outcome), reward, gap (of the action);
-            `stops`: the last state and previous; `why`: "end", "circle", "limit", or "unknown" (the policy was not
-            asked there).
+            - `steps`: a list of state, previous, action, probability (of the outcome), reward, gap (of the action)
+            - `stops`: the last state and previous
+            - `why`: "end", "circle", "limit", or "unknown" (the policy was not asked there)
         Raises:
             ParameterError: there is no such policy or position.
         """
@@ -385,9 +394,11 @@ class Exploration:
         """Losses of a policy: along its most probable path, and in all states.
 
         Returns:
-            `regret`, V* minus its value at the start; `lost`, the sum of what it loses in all states; `first`, the
-            first step of its likeliest way whose gap is no tie, as `path` has it, with its `number`, or None; `worst`,
-            the states that lose most: state, loss, visits, action chosen most.
+            - `regret`: V* minus its value at the start
+            - `lost`: the sum of what it loses in all states
+            - `first`: the first step of its likeliest way whose gap is no tie, as `path` has it, with its `number`, or
+              None
+            - `worst`: the states that lose most: state, loss, visits, action chosen most
         Raises:
             ParameterError: there is no such policy.
         """
@@ -442,7 +453,7 @@ class Exploration:
 
 
 def float_or_none(value: float | np.floating) -> float | None:
-    """A float; None if it is not a number."""
+    """A float, or None if it is not a number."""
     return float(value) if np.isfinite(value) else None
 
 
@@ -464,8 +475,8 @@ class Pictures:
     """Draws the states of an environment. If that is not possible, `fault` is the reason, in one line.
 
     Attributes:
-        kit: what all drawings are composed of, for the page; None if the states cannot be drawn.
-        fault: why they cannot; "" if they can.
+        kit: what all drawings are composed of, for the page. None if the states cannot be drawn.
+        fault: why they cannot, or "" if they can.
     """
 
     def __init__(self, env: Environment | None, start: State | None):
@@ -482,7 +493,7 @@ class Pictures:
             self.kit, self.fault = None, f"There is no drawing: {' '.join(str(error).split()) or type(error).__name__}"
 
     def of(self, state: State) -> dict[str, Any]:
-        """`cells`, a list of (layer, row, column, value); or `picture`, the URL of one that the class has of its own;
+        """`cells`, a list of (layer, row, column, value), or `picture`, the URL of one that the class has of its own,
         or `fault`."""
         if self.env is None or self.kit is None:
             return {"fault": self.fault}

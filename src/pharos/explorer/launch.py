@@ -3,7 +3,7 @@
 `Explorer` is a small local server of the page: one address, one token, GET alone, no files. It listens on the loopback
 interface. A request is answered if its Host header names this server (a page from elsewhere whose name was led here
 by DNS does not) and if its path begins with the token, compared in constant time. Answers come from a table of
-questions; no part of a request ever names a file.
+questions. No part of a request ever names a file.
 """
 
 import contextlib
@@ -47,7 +47,7 @@ class Explorer:
         exploration: what it shows.
         port: 0 for any that is free.
     Attributes:
-        url: its address, with its token, on this machine alone; whoever knows it may look.
+        url: of the page, with an access token. It can be reached from this machine only.
     Raises:
         ParameterError: the port is taken, or may not be used.
     """
@@ -119,7 +119,7 @@ def _plain_text(status: HTTPStatus, text: str) -> tuple[HTTPStatus, str, bytes]:
 
 
 def _whole(words: Mapping[str, str], name: str, otherwise: int | None = None) -> int:
-    """An integer from a query; `otherwise` if absent."""
+    """An integer from a query, `otherwise` if absent."""
     text = words.get(name, "")
     if text == "":
         if otherwise is None:
@@ -168,7 +168,7 @@ class _Http(ThreadingHTTPServer):
         super().__init__(address, handler)
 
     def process_request(self, request: Request, client_address: Address) -> None:
-        """Give the connection a thread; if there is none left, the one that has waited longest for a request ends."""
+        """Give the connection a thread. If there is none left, the one that has waited longest for a request ends."""
         if not self.connections.acquire(blocking=False):
             with contextlib.suppress(StopIteration, OSError):  # of those that send a byte now and then
                 next(iter(list(self.incomplete))).shutdown(socket.SHUT_RDWR)
@@ -284,18 +284,18 @@ def explore(  # noqa: PLR0913
     """Show an MDP state by state in the browser.
 
     Args:
-        target: an environment or its name; a state space, or the folder of one; a tabular MDP; or the folder of a
+        target: an environment or its name, a state space, or the folder of one, a tabular MDP, or the folder of a
             finished run, whose chance and policy are taken.
         policy: one to set beside the optimal and the uniform policy, as `pharos.evaluate_policy` takes it.
-        gamma: discount; None: the discount of the MDP if it is below 1, else 0.99. A horizon is left out.
+        gamma: discount. Default: the discount of the MDP if it is below 1, else 0.99. A horizon is left out.
         sticky, random, lazy: chance that is added, see `pharos.sticky_actions`.
         observation: what `policy` sees, if it is no table.
         trust: whether code that a run names may be imported.
         out: write the page with all its data into this file instead, if the space is small enough (10,000 states).
-        port: of the server; 0: any that is free.
+        port: of the server. 0: any that is free.
         browser: whether to open the page in the browser.
     Returns:
-        An Explorer, whose server answers until it is closed; with `out` the path of the file.
+        An Explorer, whose server answers until it is closed. With `out` the path of the file.
     Raises:
         ParameterError: there is no such target, the policy does not fit, the port is taken, or the space is too large
             for a file. DivergenceError: gamma is 1, and the value is infinite.
@@ -323,10 +323,10 @@ def exploration_of(
     in_one_page: bool = False,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Exploration:
-    """Exploration that `explore` shows. `title`, `progress`: as for `Exploration`; `env`: draws the states of an MDP.
+    """Exploration that `explore` shows. `title`, `progress`: as for `Exploration`. `env`: draws the states of an MDP.
 
     Args:
-        in_one_page: whether it is for a page of its own; what is too large for that is refused before it is solved.
+        in_one_page: whether it is for a page of its own. What is too large for that is refused before it is solved.
     """
     chance = chance or ChanceSetting()
     if isinstance(target, str | os.PathLike) and (Path(target) / RUN_RECORD).is_file():
@@ -408,7 +408,7 @@ def _facts(record: Mapping[str, Any], task: Task) -> dict[str, str]:
 
 
 def _title(env: Environment) -> str:
-    """The environment as a command would name it; parameters that were not given are left out."""
+    """The environment as a command would name it. Parameters that were not passed are left out."""
     parameters = {name: value for name, value in env.parameters.items() if value is not None and value != ()}
     return " ".join([env.name, *(f"{name}={_short(value)}" for name, value in parameters.items())])
 
@@ -419,7 +419,7 @@ def _short(value: object) -> str:
 
 
 def open_browser(url: str) -> bool:
-    """Open a page in the user's browser; False if there is none, or no screen to show it on."""
+    """Open a page in the user's browser. False if there is none, or no screen to show it on."""
     has_screen = bool({"DISPLAY", "WAYLAND_DISPLAY", "BROWSER"} & set(os.environ))
     if sys.platform.startswith("linux") and not has_screen:  # else a browser of the terminal would take it over
         return False

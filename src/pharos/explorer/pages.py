@@ -1,4 +1,4 @@
-"""The page: template, style and script in one text, which loads nothing; with the data of a small space inside.
+"""The page: template, style and script in one text, which loads nothing, with the data of a small space inside.
 
 Heat maps: a quantity over two variables, the others at chosen values or at any. The states of a large space are gone
 through in blocks, so that no more than some megabytes are needed beside it.
@@ -49,7 +49,7 @@ def quantities(world: Exploration) -> dict[str, str]:
 
 
 def quantity(world: Exploration, name: str, states: np.ndarray) -> np.ndarray:
-    """(N,) a quantity of states, one of `quantities`; NaN if it has none, as most have in terminal states."""
+    """(N,) a quantity of states, one of `quantities`, NaN if it has none, as most have in terminal states."""
     kind, _, policy = name.partition("_")
     if name == "layer":
         layers = world.layers.of(states).astype(np.float64)
@@ -81,13 +81,17 @@ def heat_map(
     Args:
         x, y: names of axes, across and down.
         what: a quantity, see `quantities`.
-        fixed: variable -> value, of the states that count; other variables may have any value.
+        fixed: variable -> value, of the states that count. Other variables may have any value.
         how: what a cell of several states shows: "mean", "least", "most" or "sum". Of actions: the action if all
             states have the same, else -1.
     Returns:
-        `x`, `y`: the axes; `cells`: rows of values, None if there are none; `count`: rows of numbers of states;
-        `state`: rows of the first state of each cell, -1 if there is none; `terminal`: rows of how many are
-        terminal; `low`, `high`: of all cells; `states`: how many count.
+        - `x`, `y`: the axes
+        - `cells`: rows of values, None if there are none
+        - `count`: rows of numbers of states
+        - `state`: rows of the first state of each cell, -1 if there is none
+        - `terminal`: rows of how many are terminal
+        - `low`, `high`: of all cells
+        - `states`: how many count
     Raises:
         UnknownName: an axis, a variable or a quantity does not exist. ParameterError: `how` is none of these, or the
             axes are the same.
@@ -218,7 +222,7 @@ POLICY_OF_SERVER = _policy("'self'") + "; frame-ancestors 'none'"
 
 
 def explorer_page(world: Exploration, data: dict[str, Any] | None = None) -> str:
-    """The page as HTML. `data`: what it holds of its own; None: it asks the server that it came from."""
+    """The page as HTML. `data`: what it holds of its own. None: it asks the server that it came from."""
     parts = {
         "TITLE": html.escape(world.title),
         "POLICY": html.escape(_policy("'self'" if data is None else "'none'")),
@@ -252,7 +256,7 @@ def contents(world: Exploration) -> dict[str, Any]:
 
 
 def check_page_size(mdp: TabularMDP, title: str, env: Environment | None = None) -> None:
-    """ParameterError if a page of its own does not hold all positions of an MDP; it names a smaller one of `env`."""
+    """ParameterError if a page of its own does not hold all positions of an MDP. It names a smaller one of `env`."""
     width = mdp.policy_width
     if mdp.num_states * width > MOST_POSITIONS:
         smaller = smaller_instance(env, MOST_POSITIONS // width) if env is not None else ""
@@ -265,9 +269,9 @@ def check_page_size(mdp: TabularMDP, title: str, env: Environment | None = None)
 
 
 def smaller_instance(env: Environment, most: int) -> str:
-    """Instance of the same class with at most `most` states, in words: `frozen_lake/8x8 has 64`; empty without one.
+    """Instance of the same class with at most `most` states, in words: `frozen_lake/8x8 has 64`. Empty without one.
 
-    The largest of the first MOST_INSTANCES named instances; else the same environment with one whole-number parameter
+    The largest of the first MOST_INSTANCES named instances, else the same environment with one whole-number parameter
     as much smaller as needed, by bisection. Cost: builds of at most `most` states.
     """
     named = [f"{env.name}/{name}" for name in type(env).instances][:MOST_INSTANCES]
@@ -289,7 +293,7 @@ def smaller_instance(env: Environment, most: int) -> str:
 
 
 def _num_states(make_env: Callable[[], Environment], most: int) -> int:
-    """Number of states of an environment; 0 if there is none with these parameters, or it has more than `most`."""
+    """Number of states of an environment. 0 if there is none with these parameters, or it has more than `most`."""
     with tempfile.TemporaryDirectory() as folder, contextlib.suppress(PharosError, ValueError):
         return build(make_env(), Path(folder) / "states", max_states=most, progress=False).num_states
     return 0

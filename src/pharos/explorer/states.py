@@ -47,7 +47,7 @@ class States(Protocol):
         """(N,) bool: which states of a block have these values, of the variables that are named by their number."""
 
     def number(self, values: Sequence[int]) -> int:
-        """The number of the state that has these values; ParameterError if it is not reachable."""
+        """The number of the state that has these values. ParameterError if it is not reachable."""
 
 
 class SpaceStates:
@@ -147,7 +147,7 @@ class Axis:
         name: as the page asks for it.
         variable: number of the variable.
         origin: its least value.
-        low, count, width: what the first interval is called; how many intervals; values in each of them.
+        low, count, width: what the first interval is called, how many intervals, values in each of them.
     """
 
     name: str
@@ -166,7 +166,7 @@ class Axis:
 
 
 def axes_of(states: States) -> dict[str, Axis]:
-    """Name -> axis. A variable each; if there is but one, its values fill a row, or rows if there are many."""
+    """Name -> axis. A variable each. If there is but one, its values fill a row, or rows if there are many."""
     if len(states.names) == 1:
         return {axis.name: axis for axis in _folded(states.names[0], int(states.low[0]), int(states.size[0]))}
     listed = enumerate(zip(states.names, states.low.tolist(), states.size.tolist(), strict=True))
@@ -203,7 +203,7 @@ class StateLayers:
             of numbers, and nothing is kept of each state.
     Attributes:
         counts: (L,) states of each layer.
-    Cost: one read of the successors; 8 bytes a state while they are read.
+    Cost: one read of the successors, and 8 bytes a state while they are read.
     """
 
     def __init__(self, mdp: TabularMDP, *, is_numbered: bool):
@@ -220,7 +220,7 @@ class StateLayers:
         self.counts = np.diff(ends, prepend=0)
 
     def of(self, states: np.ndarray) -> np.ndarray:
-        """(N,) the layers of states; -1 of those that no actions lead to."""
+        """(N,) the layers of states, -1 of states that no actions lead to."""
         if self._of_states is not None:
             return self._of_states[states]
         return np.searchsorted(self._ends, states, side="right")
@@ -238,7 +238,7 @@ class StateLayers:
 
 
 def _ends(dynamics: Dynamics, num_starts: int) -> np.ndarray:
-    """(L,) the number after the last state of each layer; a layer ends with the last state that the layer before leads
+    """(L,) the number after the last state of each layer. A layer ends with the last state that the layer before leads
     to."""
     farthest = np.maximum.accumulate(_largest_successors(dynamics))
     ends = [num_starts]
@@ -307,7 +307,7 @@ class Learnt:
     facts: Mapping[str, str] = field(default_factory=dict)
 
     def solution(self, mdp: TabularMDP, space: StateSpace | None) -> Solution:
-        """Values of the policy; NaN in states that it never reaches and was not asked about.
+        """Values of the policy, NaN in states that it never reaches and was not asked about.
 
         Raises:
             ParameterError: it does not fit the MDP, or its values belong to no state, as it sees more than the state.
@@ -335,7 +335,7 @@ class Learnt:
 
 
 def probabilities(solution: Solution, states: np.ndarray, previous: np.ndarray) -> np.ndarray:
-    """(N, A) action probabilities of a given policy in states after executing actions (N,); A: no action before."""
+    """(N, A) action probabilities of a given policy in states after executing actions (N,). A: no action before."""
     table, num_actions = np.asarray(solution.given_policy), solution.mdp.num_actions
     if table.ndim == 1:
         return np.eye(num_actions)[table[states]]

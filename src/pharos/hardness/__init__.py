@@ -2,7 +2,7 @@
 
 Visitation complexity: `diameter`, `start_eccentricity`, `covering`. Estimation complexity: `gaps`,
 `sum_of_reciprocal_gaps`, `minimal_gap`, `environmental_value_norm`. Planning: `effective_horizon`. All of them:
-`report`; `register` adds your own.
+`report`. `register` adds your own.
 """
 
 from typing import TYPE_CHECKING
@@ -19,7 +19,7 @@ from pharos.hardness.effective_horizon import (
     effective_horizon,
     stationary_effective_horizon,
 )
-from pharos.hardness.gaps import Gaps, gaps, minimal_gap, sum_of_reciprocal_gaps
+from pharos.hardness.gaps import ERRORS_PER_TIE, Gaps, gaps, minimal_gap, sum_of_reciprocal_gaps
 from pharos.hardness.gorp import GorpBound, GorpRuns, gorp_bound, run_gorp
 from pharos.hardness.interval import Budget, Certificate, Certified, Interval, MeasureProgress
 from pharos.hardness.registry import Measure, Problem, measures, register, selected_measures

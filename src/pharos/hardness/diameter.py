@@ -9,7 +9,7 @@ The diameter as Colosseum defines it for episodes of a fixed length. Source: Con
 If searches do not fit in memory (`LeanSweep`): two bytes a node and bound, and the table read in order. The
 algorithm is the one of sum_sweep.py, without the parts that need more memory. Distances come from sweeps over the table
 (kernels/graph.py) in place of searches with a queue and a reversed graph, which takes 8 bytes an edge. Arrays that
-memory has no room for are mapped files; bounds may be in files that outlive the process, of which the search in
+memory has no room for are mapped files. Bounds may be in files that outlive the process, of which the search in
 progress is all that is lost.
 
 `KeptBounds`: bounds on all eccentricities in a folder, so that a diameter whose searches take minutes goes on after it
@@ -62,7 +62,7 @@ def diameter(
             step.
             False: terminal states are absorbing, so that D is infinite wherever a state cannot be reached from one.
         tolerance: relative width of the interval from which on it counts as exact. Counted steps are exact anyway.
-        budget: seconds (300 by default), or a `Budget`; a value out of reach comes as the interval proven by then.
+        budget: seconds (300 by default), or a `Budget`. A value out of reach comes as the interval proven by then.
         progress: called with a `MeasureProgress` now and then.
         bounds: a folder for the bounds on all states, 8 bytes each, if memory has no room for searches of a
             deterministic MDP: the same call goes on from them after one was killed, or its budget spent. They are
@@ -103,16 +103,16 @@ def start_eccentricity(
         max over s' of min over policies of E[steps from a start state to s'], the start being drawn
 
     Args:
-        restart: as in `diameter`; without chance and with one start state it makes no difference.
-        tolerance: relative accuracy under chance, and with several start states; else it is counted.
+        restart: as in `diameter`. Without chance and with one start state it makes no difference.
+        tolerance: relative accuracy under chance, and with several start states. Without, it is counted.
         budget: seconds (300 by default), or a `Budget`, under chance and with several start states.
     Returns:
-        Steps; infinite if some state cannot be reached from some start state. An expectation comes as its upper
+        Steps, infinite if some state cannot be reached from some start state. An expectation comes as its upper
         bound, proven to lie within `tolerance`.
     Raises:
-        UndefinedMeasure: out of reach of the budget or of 64-bit floats; it names the interval that is proven.
+        UndefinedMeasure: out of reach of the budget or of 64-bit floats. It names the interval that is proven.
         `start_eccentricity_interval` returns it.
-    Cost: one search for each start state; under chance, and if terminal states lead back to several start states,
+    Cost: one search for each start state. Under chance, and if terminal states lead back to several start states,
         one stochastic shortest path problem for each target that bounds do not rule out.
     Source: the pharos paper, equation 1.
     """
@@ -197,18 +197,18 @@ def colosseum_diameter(mdp: TabularMDP, *, horizon: int | None = None) -> float:
 
         ET_e(h, e) = 0;  ET_e(h, s) = 1 + min_a E[ET_e(h + 1, s')] for h < H - 1;  ET_e(H - 1, s) = 1 + E[ET_e(0, s0)]
 
-    That time is E[ET_e(0, s0)], from the start; after H steps an episode starts again, in a state s0 of the start
+    That time is E[ET_e(0, s0)], from the start. After H steps an episode starts again, in a state s0 of the start
     distribution. Colosseum says it differently: the largest over e and s of the least positive ET_e(h, s), over
     h = H - 1 and all h at which s can be reached. At h = H - 1 it makes no exception of s = e, so e itself has
     1 + E[ET_e(0, s0)], and no state has more. Terminal states last until the episode starts again.
 
     Args:
-        horizon: H, steps; the MDP's by default.
+        horizon: H, in steps. Default: the MDP's.
     Returns:
-        Steps; infinite if some state cannot be reached within an episode with positive probability.
+        Steps, infinite if some state cannot be reached within an episode with positive probability.
     Raises:
         ParameterError: there is no horizon, or it is below 1.
-    Cost: a few backward passes of H steps for each state; O(H S^2 A) time for each pass with sparse rows.
+    Cost: a few backward passes of H steps for each state, each in O(H S^2 A) time with sparse rows.
     Source: Conserva and Rauber (2022), "Hardness in Markov decision processes: theory and practice", and its code.
     """
     expected = "an integer of at least 1, here or in the MDP"
@@ -231,7 +231,7 @@ class _Episodes:
     """Least expected times to each of several targets, through episodes of H steps.
 
     With x = E[ET(0, s0)], every policy of an episode gives x -> c + q x: c its expected steps, q the probability that
-    it misses the target. The least of these lines crosses the diagonal at x; it is found from above by Newton's method,
+    it misses the target. The least of these lines crosses the diagonal at x. It is found from above by Newton's method,
     each step of which takes the best policy for the last x. It starts with the policy that is least likely to miss.
     """
 
@@ -250,7 +250,7 @@ class _Episodes:
         return self.rho @ steps, self.rho @ misses
 
     def times_from_start(self) -> np.ndarray:
-        """(targets,), E[ET(0, s0)]; infinite if every episode from the start misses the target."""
+        """(targets,), E[ET(0, s0)], infinite if every episode from the start misses the target."""
         c, q = self._pass(np.ones(self.goal.shape[1]), 0.0)
         lost = q >= 1 - 1e-12
         x = np.where(lost, 0.0, c / np.where(lost, 1.0, 1 - q))
@@ -299,7 +299,7 @@ class KeptBounds:
         self.dtype = np.dtype(np.int16 if record.get("bytes") == 2 else np.int32)
 
     def arrays(self, dtype: np.dtype) -> np.ndarray:
-        """(4, N): lower bounds on out(v) and in(v), then upper ones; from the file, or 0 and the largest number.
+        """(4, N): lower bounds on out(v) and in(v), then upper ones, from the file, or 0 and the largest number.
 
         The record is written once these are on the disk: after a power failure a file may hold what it held before.
         """
@@ -349,7 +349,7 @@ def needs_more_than_memory(graph: Graph) -> bool:
 def lean_diameter(graph: Graph, spending: BudgetClock, folder: str | os.PathLike | None = None) -> Interval:
     """The diameter, or the interval proven within the budget.
 
-    folder: in which bounds are kept, and from which tightening goes on; None: in memory.
+    folder: in which bounds are kept, and from which tightening goes on. None: in memory.
     """
     store = None if folder is None else KeptBounds(Path(folder), graph)
 
@@ -375,7 +375,7 @@ def lean_eccentricity(graph: Graph, source: int, spending: BudgetClock) -> Inter
 
 
 def _in_two_bytes_or_four(result: Callable[[Integers], Result]) -> Result:
-    """result(dtype) with distances of two bytes; of four if one does not fit into two."""
+    """result(dtype) with distances of two bytes, or of four if one does not fit into two."""
     try:
         return result(np.int16)
     except OverflowError:
@@ -396,14 +396,14 @@ class LeanGraph:
         self.dtype, self.far = dtype, int(np.iinfo(dtype).max)
 
     def search_forward(self, source: int, distance: np.ndarray) -> tuple[int, int, int]:
-        """Set distance[v] to d(source, v), or `far`; return (nodes found, largest distance, sum of distances).
+        """Set distance[v] to d(source, v), or `far`. Return (nodes found, largest distance, sum of distances).
 
         OverflowError if a distance does not fit.
         """
         return self._swept(kernels.lower_forward, source, distance, False)
 
     def search_backward(self, source: int, distance: np.ndarray) -> tuple[int, int, int]:
-        """Set distance[v] to d(v, source); returns and raises as `search_forward`."""
+        """Set distance[v] to d(v, source). Returns and raises as `search_forward`."""
         return self._swept(kernels.lower_backward, source, distance, True)
 
     def _swept(
@@ -423,7 +423,7 @@ class LeanGraph:
         return int(reach), int(largest), int(total)
 
     def _through_end(self, distance: np.ndarray, backward: bool) -> int:
-        """Follow the edge from the end to the start, which is in no row; return whether it lowers a distance."""
+        """Follow the edge from the end to the start, which is in no row. Return whether it lowers a distance."""
         if not self.has_end or self.start < 0:
             return 0
         here, there = (self.start, self.num_nodes - 1) if backward else (self.num_nodes - 1, self.start)
@@ -437,7 +437,7 @@ class LeanSweep(SumSweep):
     """`SumSweep` on a graph that is searched by sweeps, in little memory."""
 
     def __init__(self, graph: LeanGraph, spending: BudgetClock, store: KeptBounds | None = None):
-        """store: of the bounds, in files; None: in memory."""
+        """store: of the bounds, in files. None: in memory."""
         self.graph: Any = graph
         self.spending = spending
         size, dtype = graph.num_nodes, graph.dtype

@@ -2,7 +2,7 @@
 
 What is proven. Each value is within the solution's error bound of the true one, so a gap is known to twice that. A gap
 above the tie tolerance is a gap. Below it, a tie is proven if the best action and this one pay the same and lead to
-the same states, or if equal values come from equal rewards for ever; else it may be a gap of any size, and its
+the same states, or if equal values come from equal rewards for ever. Otherwise it may be a gap of any size, and its
 reciprocal anything. Proofs that actions of equal computed value are tied:
 
 1. Two actions that pay the same and have the same outcomes are tied, whatever the MDP.
@@ -36,6 +36,7 @@ from pharos.mdp import (
     require_mdp,
 )
 from pharos.solvers import Solution, value_iteration
+from pharos.system.arrays import UNIT_ROUNDOFF
 from pharos.system.memory import large_zeros
 
 # States at once; fixed, so that sums do not depend on the machine, and so few that a block stays in the cache.
@@ -63,7 +64,7 @@ class GapBlock(NamedTuple):
         gap: (N, A).
         scale: the probability that the chosen action is executed, which each gap is multiplied by.
         weight: (N,) how many pairs (state, previous action) a row stands for.
-        counted: (N,) the same; 0 for terminal states and those that cannot be reached.
+        counted: (N,) the same, but 0 for terminal states and states that cannot be reached.
     """
 
     step: Step
@@ -85,7 +86,7 @@ def weighted_gaps(mdp: TabularMDP, solution: Solution) -> Iterator[GapBlock]:
 
 
 def _gaps_of_step(mdp: TabularMDP, step: Step, number: int, everywhere: bool) -> Iterator[GapBlock]:
-    """The gaps of one step, in blocks; `everywhere`: states that cannot be reached have a weight, too."""
+    """The gaps of one step, in blocks. With `everywhere`, states that cannot be reached have a weight, too."""
     chance = mdp.chance
     for first in range(0, mdp.num_states, _GAP_BLOCK):
         block = slice(first, min(first + _GAP_BLOCK, mdp.num_states))
@@ -163,7 +164,7 @@ def _with_end(values: np.ndarray) -> np.ndarray:
 
 
 # Different values up to which the map is kept; beyond, it would take more than 200 MB, and nothing is proven.
-MOST = 1 << 21
+MOST_MAP_VALUES = 1 << 21
 # Places of the map in the beginning.
 _FIRST = 1 << 12
 
@@ -181,7 +182,7 @@ class TieProof:
         self._step = -1
 
     def add_block(self, part: GapBlock, own: np.ndarray) -> None:
-        """Extend the proof to a block of N states with values `own` (N, W); blocks of one step come together."""
+        """Extend the proof to a block of N states with values `own` (N, W). Blocks of one step come together."""
         if not self.holds:
             return
         if part.number != self._step:  # values of different steps are different
@@ -199,7 +200,7 @@ class TieProof:
         begin = 0
         while self.holds and begin < len(gap):
             begin, self._filled = kernels.extend(*bits, gap, counted, begin, self._map, self._filled)
-            if begin < 0 or self._filled > MOST:
+            if begin < 0 or self._filled > MOST_MAP_VALUES:
                 self.holds = False
             elif begin < len(gap):
                 larger = _empty_map(4 * len(self._map), own.shape[1])
@@ -214,7 +215,7 @@ def _empty_map(size: int, width: int) -> np.ndarray:
 def same_outcomes(
     mdp: TabularMDP, states: np.ndarray, rewards: np.ndarray, action: np.ndarray, other: np.ndarray
 ) -> np.ndarray:
-    """(K,) bool: whether two actions pay the same and have the same outcomes, the first proof; rewards (K, A) of the
+    """(K,) bool: whether two actions pay the same and have the same outcomes, the first proof. rewards: (K, A) of the
     states (K,)."""
     rows = np.arange(len(states))
     same = rewards[rows, action] == rewards[rows, other]
@@ -233,7 +234,7 @@ class UnresolvedTies:
     """Count of the ties that are not proven to be ties.
 
     Attributes:
-        small: gaps that are computed as larger than 0, and no larger than the tolerance; if the tolerance is part of
+        small: gaps that are computed as larger than 0, and no larger than the tolerance. If the tolerance is part of
             the definition, gaps that are within their error of it.
         equal: gaps that are computed as 0, beyond the first of a state.
     """
@@ -260,7 +261,7 @@ class UnresolvedTies:
             self.proof.add_block(part, own)
 
     def unresolved(self, parts: Iterator[GapBlock]) -> int:
-        """Number of ties that are not proven; `parts`: all blocks once more, for proofs one by one."""
+        """Number of ties that are not proven. `parts`: all blocks once more, for proofs one by one."""
         if self.is_exact and not self.is_definition:
             return 0
         if self.is_definition or (not self.small and self.proof.holds):
@@ -298,7 +299,6 @@ VALUE_WIDTH = 1e-6
 ERRORS_PER_TIE = 2.5
 # Relative rounding of a gap, its reciprocal and sums of these: a few units each, and one for each action.
 _ROUNDING = 1e-12
-_UNIT = 2.0**-53
 # Sweeps at most, after the solution, until values settle; and sweeps that change values by no more than rounding.
 _SWEEPS = 200
 _AT_REST = 40
@@ -315,14 +315,14 @@ class Gaps:
             `upper` is infinite if ties are unresolved.
         regularized: sum of 1 / (gap + 0.1) over all states and actions, optimal ones and terminal states included, as
             Colosseum prints it.
-        minimal: the smallest gap > tie_tolerance; infinite if there is none.
+        minimal: the smallest gap > tie_tolerance, infinite if there is none.
         count, ties: how many gaps exceed tie_tolerance, and how many do not, the best actions among them.
-        unresolved: how many ties are not proven, so that they may be gaps smaller than the tolerance; with a
+        unresolved: how many ties are not proven, so that they may be gaps smaller than the tolerance. With a
             `tie_tolerance` of the caller's own, how many gaps are within their error of it.
         small: how many gaps are computed as larger than 0, and no larger than the tolerance.
         histogram, edges: (B,) numbers of gaps in bins of a quarter of a decade, and their (B + 1,) edges.
         tie_tolerance: gaps up to it count as ties.
-        error: of a gap, at most; twice the error bound of the solution.
+        error: largest error of a gap, twice the error bound of the solution.
         conventions: what the values refer to.
     """
 
@@ -377,7 +377,7 @@ class Gaps:
         return Certified(value, lower, upper, exact, note, extra)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able; what is infinite is None."""
+        """JSON-able, with None for what is infinite."""
         return fields_of(self, "small", "conventions")
 
     def __str__(self) -> str:
@@ -400,18 +400,18 @@ def gaps(
         gap(s, a) = V*(s) - Q*(s, a)
 
     Under random actions Q* is the value of choosing an action. Under sticky actions a state is a pair (state,
-    previously executed action) that can be reached, and a start state without a previous action is one more; gap((s,
+    previously executed action) that can be reached, and a start state without a previous action is one more. gap((s,
     b), a) is the weight of the choice times the difference of the values of executing. With a horizon T, gaps belong to
     steps: the sum runs over t = 1, ..., T and the states that can be reached at step t, as in Simchowitz and Jamieson.
 
     Args:
-        solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9, and if that leaves ties
+        solution: the optimal solution of `mdp`. Default: solved here to an error of 1e-9, and if that leaves ties
             unresolved to what 64-bit floats can reach.
         tie_tolerance: gaps up to it count as ties. None: 2.5 times the error bound of the solution.
     Raises:
         ParameterError: `solution` belongs to another MDP or is not optimal.
         PrecisionError: tie_tolerance is not larger than twice the error bound, so that a tie could be counted as a gap.
-    Cost: one pass over the table, 50 to 100 ns a state with its proofs of ties, and 1 to 40 sweeps before it; with a
+    Cost: one pass over the table, 50 to 100 ns a state with its proofs of ties, and 1 to 40 sweeps before it. With a
         horizon T passes and 8 T S bytes.
     Source: Simchowitz and Jamieson (2019), "Non-asymptotic gap-dependent regret bounds for tabular MDPs", section 2;
         the pharos paper, equation 2; regularized: Colosseum (Conserva and Rauber, 2022).
@@ -424,10 +424,10 @@ def gaps(
 def resolved_gaps(
     mdp: TabularMDP, solution: Solution, in_place: bool = False, go_on: Callable[[], bool] = lambda: True
 ) -> Gaps:
-    """The gaps of a solution; of a more accurate one if ties are unresolved, or the sum is wide.
+    """The gaps of a solution, or of a more accurate one if ties are unresolved or the sum is wide.
 
-    in_place: whether the values of the solution may become the more accurate ones; its bound holds for these, too.
-    go_on: whether there may be another sweep; asked before each.
+    in_place: whether the values of the solution may become the more accurate ones. Its bound holds for these, too.
+    go_on: whether there may be another sweep, asked before each.
     """
     if solution.horizon is not None or mdp.gamma == 1.0:
         return _summed(mdp, solution, None)
@@ -450,7 +450,7 @@ def _settled(mdp: TabularMDP, solution: Solution, in_place: bool, go_on: Callabl
     """
     equation = BellmanEquation(mdp.reward_table, mdp.gamma, mdp.chance, BEST)
     operations = 2 * mdp.num_actions + mdp.dynamics.operations + 16
-    rho = mdp.gamma * max(1.0, mdp.dynamics.mass) * (1 + 16 * _UNIT)
+    rho = mdp.gamma * max(1.0, mdp.dynamics.mass) * (1 + 16 * UNIT_ROUNDOFF)
     if rho >= 1:
         return solution
     largest_reward = max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest))
@@ -464,7 +464,7 @@ def _settled(mdp: TabularMDP, solution: Solution, in_place: bool, go_on: Callabl
         sweeps += 1
         change = mdp.dynamics.sweep(equation, x)
         largest += change
-        rounding = operations * _UNIT * (largest_reward + largest + change) + mdp.reward_table.rounding
+        rounding = operations * UNIT_ROUNDOFF * (largest_reward + largest + change) + mdp.reward_table.rounding
         bound = min(bound, (rho * change + rounding) / (1 - rho) * (1 + _ROUNDING))
         at_rest += change <= rounding
         if change == 0.0 or at_rest == _AT_REST:
@@ -480,7 +480,7 @@ def sum_of_reciprocal_gaps(
     tie_tolerance: float | None = None,
     regularized: bool = False,
 ) -> float:
-    """Return the sum of 1 / gap(s, a) over reachable, non-terminal states s and actions a with a gap; as `gaps` says.
+    """Return the sum of 1 / gap(s, a) over reachable, non-terminal states s and actions a with a gap, as `gaps` says.
 
     Args:
         regularized: instead, the sum of 1 / (gap + 0.1) over all states and actions.
@@ -496,7 +496,7 @@ def minimal_gap(
     *,
     tie_tolerance: float | None = None,
 ) -> float:
-    """Return the smallest gap(s, a) that is no tie; infinite if there is none. As `gaps` says."""
+    """Return the smallest gap(s, a) that is no tie, infinite if there is none. As `gaps` says."""
     return gaps(mdp, solution, tie_tolerance=tie_tolerance).minimal
 
 
@@ -534,7 +534,7 @@ def optimal_solution(mdp: TabularMDP, solution: Solution | None) -> Solution:
 
 
 def solution_within(solve: Callable[..., Solution], mdp: TabularMDP, tolerance: float, **options: Any) -> Solution:
-    """A solution to a tolerance, in return; if floats do not reach it, to the least multiple by a power of ten that
+    """A solution to a tolerance, in return. If floats do not reach it, to the least multiple by a power of ten that
     they reach, which `error_bound` says.
 
     Raises:
@@ -613,7 +613,7 @@ def _summed(mdp: TabularMDP, solution: Solution, tie_tolerance: float | None) ->
 
 
 class _Sums:
-    """Sums over the gaps of states, a block at a time; the arrays are described in `kernels.gaps`.
+    """Sums over the gaps of states, a block at a time. The arrays are described in `kernels.gaps`.
 
     Attributes:
         minimal: the smallest gap above the tolerance. num_pairs: how many gaps count.
@@ -628,7 +628,7 @@ class _Sums:
         self.minimal, self.num_pairs = math.inf, 0
 
     def add(self, part: GapBlock, tolerance: float, error: float) -> tuple[int, int]:
-        """Add a block; return how many of its ties are small, and how many equal."""
+        """Add a block. Return how many of its ties are small, and how many equal."""
         previous = self.counts.copy()
         arguments = (tolerance, error, REGULARIZER, self.sums, self.counts, self.histogram)
         self.minimal = kernels.add_up(part.gap, part.weight, part.counted, self.minimal, *arguments)

@@ -31,9 +31,8 @@ class GorpBound:
     """Bound on the samples that GORP needs, for each k.
 
     Attributes:
-        value: the effective horizon by this bound, the smallest H_k; infinite if no number of samples is proven to
-            do.
-        ks, ms, values: k, the samples m for each sequence, and H_k = k + log_A m; m is None if H_k is infinite.
+        value: the effective horizon by this bound, the smallest H_k, infinite if no number of samples is proven to do.
+        ks, ms, values: k, the samples m for each sequence, and H_k = k + log_A m. m is None if H_k is infinite.
         failure_probabilities: the bound on the probability of failure at m, at most 1/2.
         proven: whether every method is proven. `binomial` is not, if all returns of a node may be 0 at once.
         conventions: horizon, methods, precision of m, tie tolerance.
@@ -48,7 +47,7 @@ class GorpBound:
     conventions: dict[str, Any] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able; infinite values are None."""
+        """JSON-able, with None for infinite values."""
         return {**fields_of(self, "conventions"), **self.conventions}
 
     def __str__(self) -> str:
@@ -75,14 +74,14 @@ def gorp_bound(
     available, and A is the largest number of available actions in a state.
 
     Args:
-        horizon: T; None: the MDP's.
+        horizon: T. Default: the MDP's.
         max_k: k = 1, ..., max_k are tried.
-        methods: of `binomial` (as BRIDGE has it: k = 1, returns 0 or R, m up to 10^6; 100 cells by quantiles, without
+        methods: of `binomial` (as BRIDGE has it: k = 1, returns 0 or R, m up to 10^6, 100 cells by quantiles, without
             the outcome that all samples are 0, which is given to every sequence only in so far as the bounds do not add
             up to 1), `bernstein` (up to 100 sequences) and `exact` (returns 0 or R, any k, m up to 10^6: the
             probabilities themselves). The first two are the default, and give the effective horizons that BRIDGE
             published. With `exact` instead of `binomial` the bound is proven, and far smaller.
-        progress: called with a line now and then; an exception of its own ends the computation.
+        progress: called with a line now and then. An exception that it raises ends the computation.
     Raises:
         UndefinedMeasure: the MDP has chance or several outcomes: GORP's sequences of actions then lead nowhere in
             particular.
@@ -165,7 +164,7 @@ def run_gorp(
     Args:
         k: actions that are tried before play becomes random.
         m: samples of each of the A^k sequences.
-        horizon: T; None: the MDP's.
+        horizon: T. Default: the MDP's.
         runs: repetitions, each with random numbers of its own.
         seed: of the random numbers.
     Raises:
@@ -220,7 +219,7 @@ def _completions(
 
 
 def _possible(tree: FiniteHorizonValues, nodes: np.ndarray, t: int, sequences: np.ndarray) -> np.ndarray | None:
-    """(n, L) bool: the sequences of actions (L, k) that can be executed from nodes (n,) at step t; None: all can."""
+    """(n, L) bool: the sequences of actions (L, k) that can be executed from nodes (n,) at step t. None: all can."""
     if tree.sets is None:
         return None
     assert tree.table is not None

@@ -14,13 +14,13 @@ sign.
 
 The slow mode. If an attempt mostly fails and begins again, sweeps bring J nearer by one failure each. What is
 missing then has one shape: W(n), how likely the target is missed for long from n. It is swept along,
-W(n) = sum_m p(m | n, a) W(m) under the best actions, beginning with 1. A sweep adds f to J and takes g from W; if f
-is nearly c g, J + c W is the solution, but for what sweeps mend. If J is so low that the best actions never arrive,
-as each failure costs less than is missing, J is raised by itself along W first: from above, attempts are worth their
+W(n) = sum_m p(m | n, a) W(m) under the best actions, beginning with 1. A sweep adds f to J and takes g from W. If f is
+nearly c g, J + c W is the solution, but for what sweeps mend. If J is so low that the best actions never arrive, as
+each failure costs less than is missing, J is raised by itself along W first: from above, attempts are worth their
 while.
 
 Rounding. Rows sum to 1, so T J(n) - J(n) = 1 + min_a sum_m p(m | n, a) (J(m) - J(n)), and its rounding error is a few
-units in the last place of sum_m p(m | n, a) |J(m) - J(n)|; the kernels add it to `above` and `below`. What is left is
+units in the last place of sum_m p(m | n, a) |J(m) - J(n)|. The kernels add it to `above` and `below`. What is left is
 that J itself is rounded: a float of 1e10 is known to 1e-6 steps, and each of the 1e10 visits on the way to the target
 may lose as much. So beyond 1e9 or so J is kept as the sum of two floats, improved by Newton's method (`_refined`), and
 moved up and down by W with
@@ -152,7 +152,7 @@ class HittingTimes:
         matrix = choices.matrix
         self.choices = choices
         self.support = (matrix.indptr.astype(np.int64), matrix.indices.astype(np.int64), choices.num_actions)
-        self.arrays = (*without_common(matrix, choices.num_actions), choices.is_restart)
+        self.rows = hitting.Rows._make((*without_common(matrix, choices.num_actions), choices.is_restart))
         first, previous = choices.reversed
         self.back = (first.astype(np.int64), previous.astype(np.int64))
         self.node_order = np.argsort(choices.underlying, kind="stable")
@@ -184,7 +184,7 @@ class HittingTimes:
         return float(np.quantile(j[there] / self.distance[there], 0.99)) if there.any() else 1.0
 
     def distances(self, target: int) -> int:
-        """Put the nodes that lead to the target into `order` by their `distance`; returns how many they are."""
+        """Put the nodes that lead to the target into `order` by their `distance`. Returns how many they are."""
         self.goal[:] = False
         self.goal[self.nodes_of(target)] = True
         return int(hitting.backward_order(*self.back, self.goal, self.order, self.distance))
@@ -211,7 +211,7 @@ class HittingTimes:
 
     def bounds(self, j: np.ndarray, count: int) -> HittingBounds:
         """Bounds by the residuals of J; the greedy policy stands in `policy` then. `least` is the best lower one."""
-        arrays = (*self.arrays, self.goal, self.order, count, j, None, self.policy, None, None)
+        arrays = (self.rows, self.goal, self.order[:count], j, None, self.policy, None)
         above, below, largest = hitting.residual_bounds(*arrays)
         bounds = certified(above, below, largest)
         self.least = max(self.least, bounds.lower)
@@ -222,7 +222,7 @@ class HittingTimes:
         move."""
         for number in range(sweeps):
             if self.swept < PLAIN_SWEEPS:
-                change = hitting.sweep_in_place(*self.arrays, self.goal, self.order, count, j, None)[0]
+                change = hitting.sweep_in_place(self.rows, self.goal, self.order[:count], j, None)[0]
             else:
                 change = self._sweep_with_mode(j, count)
             self.swept += 1
@@ -235,12 +235,11 @@ class HittingTimes:
         return self.bounds(j, count)
 
     def _sweep_with_mode(self, j: np.ndarray, count: int) -> float:
-        """Sweep J and the slow mode, along which J is moved now and then; return the largest change by the sweep."""
+        """Sweep J and the slow mode, along which J is moved now and then. Return the largest change by the sweep."""
         if self.mode is None:
             self.mode = np.zeros(len(j))
             self.mode[self.order[:count]] = ~self.goal[self.order[:count]]
-        arrays = (*self.arrays, self.goal, self.order, count, j, self.mode)
-        change, ff, fg, gg = hitting.sweep_in_place(*arrays)
+        change, ff, fg, gg = hitting.sweep_in_place(self.rows, self.goal, self.order[:count], j, self.mode)
         if self.swept % TIME_CHECKS != TIME_CHECKS - 1 or not (gg > 0 and math.isfinite(ff) and change > 0):
             return float(change)
         nodes = self.order[:count]
@@ -266,7 +265,7 @@ class HittingTimes:
             improved = self._evaluate(count)
             if improved is None:  # the greedy policy may stay away for ever: begin with one that does not
                 arrays = (*self.support[:2], self.choices.matrix.data, self.support[2])
-                hitting.proper_policy(*arrays, self.goal, self.order, count, np.empty_like(self.goal), self.policy)
+                hitting.proper_policy(*arrays, self.goal, self.order[:count], self.policy)
                 improved = self._evaluate(count)
             if improved is None:
                 failures += 1
@@ -323,7 +322,7 @@ class HittingTimes:
         return np.bincount(self.distance[self.order[:count]])
 
     def _factored(self, count: int) -> "tuple[np.ndarray, Factors] | None":
-        """(inner nodes, factors of 1 - P of the greedy policy); None if no policy is proper. Rows are made to sum to
+        """(inner nodes, factors of 1 - P of the greedy policy), or None if no policy is proper. Rows are made to sum to
         1."""
         nodes = self.order[:count]
         inner = nodes[~self.goal[nodes]]
@@ -331,7 +330,7 @@ class HittingTimes:
         return None if factors is None else (inner, factors)
 
     def _evaluate(self, count: int) -> np.ndarray | None:
-        """The hitting times of the greedy policy; None if it is not proper."""
+        """The hitting times of the greedy policy, or None if it is not proper."""
         factored = self._factored(count)
         if factored is None:
             return None
@@ -348,7 +347,7 @@ class HittingTimes:
     def _refined(
         self, j: np.ndarray, count: int, tolerance: float, plain: HittingBounds, spending: BudgetClock
     ) -> HittingBounds:
-        """Bounds of a J that is the sum of two floats; `plain`, the bounds of one, if these are no better. j
+        """Bounds of a J that is the sum of two floats, or `plain`, the bounds of one, if these are no better. j
         becomes J + W."""
         high, low = j.copy(), np.zeros_like(j)
         best, policy = plain.but_limited(), None
@@ -383,8 +382,8 @@ class HittingTimes:
         factored: tuple[np.ndarray, "Factors"],
         spending: BudgetClock,
     ) -> tuple[HittingBounds, np.ndarray]:
-        """(bounds of J* relative to J + W, J + W rounded up); a policy that is greedy in J - W in place of one in J
-        if ties need it."""
+        """(bounds of J* relative to J + W, J + W rounded up), by a policy that is greedy in J - W in place of J if ties
+        need it."""
         inner, factors = factored
         residual, error, _ = self._residuals(high, low, count)
         cost = 2 * (np.abs(residual[inner]) + error[inner])
@@ -413,11 +412,11 @@ class HittingTimes:
     def _residuals(
         self, high: np.ndarray, low: np.ndarray, count: int
     ) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
-        """(residuals of J = high + low, their errors, (bound of T J - J, bound of J - T J)); the greedy policy stands
+        """(residuals of J = high + low, their errors, (bound of T J - J, bound of J - T J)). The greedy policy stands
         in `policy`."""
-        residual, error = np.zeros_like(high), np.zeros_like(high)
-        arrays = (high, low, self.policy, residual, error)
-        return residual, error, hitting.residual_bounds(*self.arrays, self.goal, self.order, count, *arrays)[:2]
+        residuals = np.zeros_like(high), np.zeros_like(high)
+        arrays = (self.rows, self.goal, self.order[:count], high, low, self.policy, residuals)
+        return *residuals, hitting.residual_bounds(*arrays)[:2]
 
 
 # Hitting equations ----------------------------------------------------------------------------------------------------
@@ -450,7 +449,7 @@ def multiplications(layers: np.ndarray) -> float:
 
 
 def factors_of(choices: ExpandedMDP, policy: np.ndarray, inner: np.ndarray) -> Factors | None:
-    """The factors of 1 - P of a policy on the `inner` nodes; None if it is not proper. Rows are made to sum to 1."""
+    """The factors of 1 - P of a policy on the `inner` nodes, or None if it is not proper. Rows are made to sum to 1."""
     first, unknown = _numbered_once(choices.is_restart[inner])
     index = np.full(len(policy), first.size)  # what leads elsewhere is left out of the equations
     index[inner] = unknown
@@ -490,13 +489,13 @@ def _numbered_once(is_restart: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.flatnonzero(opens), group
 
 
-def without_common(matrix: "csr_matrix", num_actions: int) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+def without_common(matrix: "csr_matrix", num_actions: int) -> tuple[np.ndarray, ...]:
     """Rows split into the part that all actions of a node share, to be added up once, and the rest of each action.
 
     Under random and sticky actions most of a row is shared.
 
     Returns:
-        ((first, node, weight) of the rest, one row for each action; (first, node, weight) of the shared part, one row
+        ((first, node, weight) of the rest, one row for each action, (first, node, weight) of the shared part, one row
         for each node).
     """
     nodes = matrix.shape[0] // num_actions
@@ -515,7 +514,5 @@ def without_common(matrix: "csr_matrix", num_actions: int) -> tuple[tuple[np.nda
     shared = least > 0
     first = np.concatenate([[0], np.cumsum(np.bincount(row[distinct], minlength=matrix.shape[0]))])
     always = np.concatenate([[0], np.cumsum(np.bincount(pairs[shared] // nodes, minlength=nodes))])
-    return (
-        (first.astype(np.int64), matrix.indices[distinct].astype(np.int64), rest[distinct]),
-        (always.astype(np.int64), (pairs[shared] % nodes).astype(np.int64), least[shared]),
-    )
+    rest_of_rows = first.astype(np.int64), matrix.indices[distinct].astype(np.int64), rest[distinct]
+    return *rest_of_rows, always.astype(np.int64), (pairs[shared] % nodes).astype(np.int64), least[shared]

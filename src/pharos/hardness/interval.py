@@ -14,7 +14,7 @@ from pharos.system.compiling import Stopwatch
 
 
 def finite(value: object) -> object:
-    """The value with None in place of what is infinite or NaN, as JSON has no such numbers; arrays as lists."""
+    """The value with None in place of what is infinite or NaN, as JSON has no such numbers. Arrays become lists."""
     if isinstance(value, Mapping):
         return {key: finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -34,17 +34,17 @@ class Interval:
     """A value between two proven bounds.
 
     Attributes:
-        lower, upper: the value lies in [lower, upper]; both are infinite if the value is.
+        lower, upper: the value lies in [lower, upper]. Both are infinite if the value is.
         exact: whether the interval is the value: lower == upper for counted steps, a relative width of at most
             `tolerance` for expected ones.
         unreachable_pairs: ordered pairs (s, s') such that no policy leads from s to s' with probability 1.
-        finite_part: the largest value among the other pairs; equal to `upper` if the value is finite and exact.
-        counted: whether `unreachable_pairs` and `finite_part` are exact; else both are lower bounds.
+        finite_part: the largest value among the other pairs. Equal to `upper` if the value is finite and exact.
+        counted: whether `unreachable_pairs` and `finite_part` are exact. Otherwise both are lower bounds.
         tolerance: relative width up to which the interval counts as exact.
         searches: searches of the graph, or targets solved, that it took.
         method: how it was computed.
         conventions: what the value refers to.
-        note: why it is not exact or not finite, or anything else worth knowing; empty otherwise.
+        note: why it is not exact or not finite, or anything else worth knowing. Empty otherwise.
         seconds: time that it took.
     """
 
@@ -70,7 +70,7 @@ class Interval:
             )
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able; an infinite bound is None, as in JSON nothing else is, and `infinite` says so."""
+        """JSON-able. An infinite bound is None, as in JSON nothing else is, and `infinite` says so."""
         first = dict.fromkeys(("lower", "upper", "exact"))  # the order of keys
         return {**first, "infinite": math.isinf(self.lower), **fields_of(self, "conventions", "seconds")}
 
@@ -91,7 +91,7 @@ class Certified:
         value: the number as computed.
         lower, upper: the true one lies in [lower, upper].
         exact: whether the interval is the value: its relative width is at most 1e-6, and no question is open.
-        note: why it is not exact; empty otherwise.
+        note: why it is not exact. Empty otherwise.
         details: anything else worth knowing, JSON-able.
     """
 
@@ -119,8 +119,8 @@ class Certificate:
     Attributes:
         kind: "exact", proven to be the value (counted, or to a relative width of 1e-6 and less); "interval", proven to
             contain the value; "float64", computed in 64-bit floats without a bound of the error.
-        lower, upper: of the interval; None for "float64", and for results that are more than one number.
-        note: why it is not exact; empty otherwise.
+        lower, upper: of the interval. None for "float64", and for results that are more than one number.
+        note: why it is not exact. Empty otherwise.
         details: anything else worth knowing, JSON-able: ties, for measures of gaps.
     """
 
@@ -136,7 +136,7 @@ class Certificate:
         return self.kind == "exact"
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able; infinite ends are None."""
+        """JSON-able, with None for infinite ends."""
         return {**fields_of(self, "details"), **self.details}
 
 
@@ -170,7 +170,7 @@ class Budget:
 
     Attributes:
         seconds: of wall clock without compiling, looked at between searches.
-        searches: searches of the graph, or targets solved; unlike seconds, the same on every machine.
+        searches: searches of the graph, or targets solved. Unlike seconds, the same on every machine.
     """
 
     seconds: float = 300.0
@@ -248,11 +248,11 @@ class BudgetClock:
 
     @property
     def seconds_left(self) -> float:
-        """Seconds until the budget ends; infinite if it does not limit them."""
+        """Seconds until the budget ends, infinite if it does not limit them."""
         return self.budget.seconds - self.seconds
 
     def check(self, line: str) -> None:
-        """MeasureUnfinished if the seconds are over; `line` says how far the work is."""
+        """MeasureUnfinished if the seconds are over. `line` says how far the work is."""
         if self.seconds_left <= 0:
             spent = f"the budget of {self.budget.seconds:g} s ended at {line}" if line else "the budget has ended"
             raise MeasureUnfinished(f"not available: {spent}; give a larger one (--budget)")

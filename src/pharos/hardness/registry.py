@@ -1,4 +1,4 @@
-"""Registry of the measures of a report, with name, function, definition and source; and the measures of pharos."""
+"""Registry of the measures of a report, with name, function, definition and source, and the measures of pharos."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -35,16 +35,16 @@ class Problem:
 
     Attributes:
         mdp: the MDP. Values and gaps have its gamma, and its horizon if it has one.
-        horizon: number of steps T for measures of episodes; the MDP's if it has one; or None.
-        tolerance: largest error of a value, in units of return; a larger one is used if floats cannot reach it.
+        horizon: number of steps T for measures of episodes: the MDP's if it has one, or None.
+        tolerance: largest error of a value, in units of return. A larger one is used if floats cannot reach it.
         restart: convention of the diameter: terminal states lead back to the start.
         budget: of each measure, after which it returns a proven interval.
         progress: called with the name of the running measure and a line on its progress.
-        representation: of the states by the agent's network, for measures that need one; or None.
+        representation: of the states by the agent's network, for measures that need one, or None.
         schedule: of the idealised learner.
-        rollouts: of the idealised actor-critic; None: the defaults of `Rollouts`.
-        sampling: of the learner that draws; None: the default of `Sampling`.
-        folder: in which optimal values and bounds of searches are kept while they are computed; None: in memory.
+        rollouts: of the idealised actor-critic. Default: the defaults of `Rollouts`.
+        sampling: of the learner that draws. Default: the default of `Sampling`.
+        folder: in which optimal values and bounds of searches are kept while they are computed. None: in memory.
         is_strict: whether the budget also ends measures without bounds to show for it, which are then not available.
         clock: of the running measure.
     """
@@ -69,7 +69,7 @@ class Problem:
 
     @property
     def solution(self) -> Solution:
-        """Optimal values; MeasureUnfinished if the budget of a measure ended before they were there."""
+        """Optimal values. MeasureUnfinished if the budget of a measure ended before they were there."""
         if isinstance(self._solved, MeasureUnfinished):
             raise self._solved
         return self._solved
@@ -90,7 +90,7 @@ class Problem:
 
     @property
     def error_bound(self) -> float | None:
-        """Error bound of the optimal values; None if no measure has used them, or the budget has ended them."""
+        """Error bound of the optimal values. None if no measure has used them, or the budget has ended them."""
         result = vars(self).get("_solved")
         return result.error_bound if isinstance(result, Solution) else None
 
@@ -103,19 +103,19 @@ class Problem:
         return not self.is_strict or self.clock.seconds_left > 0
 
     def episode(self, measure: str) -> int:
-        """The horizon; UndefinedMeasure if there is none."""
+        """The horizon. UndefinedMeasure if there is none."""
         if self.horizon is None:
             raise UndefinedMeasure(f"{measure} is defined for episodes of T steps: give a horizon")
         return self.horizon
 
     def seen(self, measure: str) -> Representation:
-        """The representation; UndefinedMeasure if there is none."""
+        """The representation. UndefinedMeasure if there is none."""
         if self.representation is None:
             raise UndefinedMeasure(f"{measure} is of what an agent sees: give an observation and a network")
         return self.representation
 
     def report(self, what: str, line: str) -> None:
-        """Report progress; MeasureUnfinished if the budget has ended, so that every loop that reports keeps to it."""
+        """Report progress. MeasureUnfinished if the budget has ended, so that every loop that reports keeps to it."""
         if self.is_strict:
             self.clock.check(line)
         self._show(what, line)
@@ -155,17 +155,17 @@ class Measure:
 
     Attributes:
         name: key of the result.
-        function: Problem -> a number, or an object with `to_dict()`; UndefinedMeasure if it does not exist. The
-            result's attributes `exact`, `lower`, `upper`, `note`, as of `Certified`, state its proven interval; a plain
+        function: Problem -> a number, or an object with `to_dict()`. It raises UndefinedMeasure if there is no value.
+            The result's attributes `exact`, `lower`, `upper`, `note`, as of `Certified`, state its proven interval. A
             number has none, and is reported as "float64".
         definition: formula, in a line.
         source: who defined it.
         complexity: "visitation", "estimation", "planning", "representation" or "other".
-        version: goes up when the function's results change, so that kept ones are not used; None: never keep results.
+        version: goes up when the function's results change, so that kept ones are not used. None: never keep results.
         depends: on what results depend, beside the transitions, chance and start: "structure" (nothing else), "values"
             (rewards, gamma), "episodes" (rewards, horizon), "all" (these), "representation" (what the agent sees, too).
-        on_request: only part of a report if it is named, or if all are asked for; if it depends on the
-            representation, also if one is given.
+        on_request: only part of a report if it is named, or if all are asked for. If it depends on the representation,
+            also if one is given.
     """
 
     name: str
@@ -198,7 +198,7 @@ def register(
 
     Args:
         function: takes a `Problem` (`.mdp`, `.solution`, `.gaps`, `.horizon`, `.budget`) and returns a number, a
-            `Certified` number, or an object with `to_dict()`; see `Measure`.
+            `Certified` number, or an object with `to_dict()`, see `Measure`.
         definition, source: printed beside the value.
         version: give one to keep results beside the state space, and raise it when the function changes.
         depends, on_request: see `Measure`.
@@ -221,13 +221,13 @@ def measures() -> dict[str, Measure]:
 
 
 def selected_measures(names: str | Iterable[str] | None, is_seen: bool = False) -> list[Measure]:
-    """The measures of these names; None: all but those on request; "all": these as well.
+    """The measures of these names. None: all but those on request. "all": these as well.
 
     Args:
-        is_seen: whether there is a representation; without names, measures of it are among them then.
+        is_seen: whether there is a representation. If so, and without names, measures of it are among them.
 
     Raises:
-        UnknownName: there is no such measure; the nearest is suggested.
+        UnknownName: there is no such measure. The nearest is suggested.
     """
     if names is None:
         wanted = _MEASURES.values()
@@ -431,7 +431,7 @@ register(
 
 
 def _represented(function: Callable[..., Outcome], problem: Problem, *options: str) -> Outcome:
-    """Result of a measure of the representation; options: names in `problem`, beside schedule and horizon."""
+    """Result of a measure of the representation. options: names in `problem`, beside schedule and horizon."""
     name, representation = function.__name__, problem.seen(function.__name__)
     settings = {option: getattr(problem, option) for option in ("schedule", "horizon", *options)}
     return function(problem.mdp, representation, progress=problem.reporter(name), **settings)

@@ -1,4 +1,4 @@
-"""All measures of an MDP in one table, with definitions and sources; kept beside the state space.
+"""All measures of an MDP in one table, with definitions and sources, kept beside the state space.
 
 `hardness.json` has the results beside the state space, each sealed by a digest and tied to what it depends on.
 """
@@ -33,9 +33,9 @@ class Result:
 
     Attributes:
         name, definition, source, complexity: of the measure.
-        value: a number, or the measure's result as a dictionary; None if it is undefined.
+        value: a number, or the measure's result as a dictionary, or None if it is undefined.
         text: the value for people.
-        undefined: why there is no value, and what would define it; empty if there is one.
+        undefined: why there is no value, and what would define it. Empty if there is one.
         is_out_of_budget: whether there is no value because the budget ended.
         seconds: time that it took, when it was computed.
         kept: whether it stood beside the state space, and was not computed now.
@@ -56,7 +56,7 @@ class Result:
 
     @property
     def exact(self) -> bool:
-        """Whether the value is proven; see `certificate`."""
+        """Whether the value is proven, see `certificate`."""
         return self.certificate.is_exact
 
 
@@ -78,8 +78,8 @@ class Report:
         return self.results[name]
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able: `measures`, `conventions`, `seconds`; what is proven of each under `certificates`, and under
-        `undefined` why some are None."""
+        """JSON-able: `measures`, `conventions`, `seconds`. What is proven of each stands under `certificates`, and why
+        some are None under `undefined`."""
         return {
             "measures": {name: finite(result.value) for name, result in self.results.items()},
             "conventions": dict(self.conventions),
@@ -138,9 +138,9 @@ def report(  # noqa: PLR0913
     """Measure how hard an MDP is.
 
     Args:
-        measures: names, as a sequence or with commas; None: all that are registered but for those that are slow and
-            come on request; "all": these as well.
-        horizon: number of steps T for measures of episodes; None: the MDP's, if any. Values and gaps have the
+        measures: names, as a sequence or with commas. Default: all that are registered, without the slow ones that come
+            on request. "all": these as well.
+        horizon: number of steps T for measures of episodes. Default: the MDP's, if any. Values and gaps have the
             gamma and the horizon of the MDP itself.
         tolerance: largest error of the optimal values, in units of return.
         restart: convention of the diameter: terminal states lead back to the start.
@@ -150,15 +150,15 @@ def report(  # noqa: PLR0913
             folder.
         progress: called with the name of the running measure and a line on how far it is.
         on_result: called with each `Result` as soon as it is there.
-        representation: what the agent's network makes of the states, `pharos.observations.representation`; with one,
+        representation: what the agent's network makes of the states, `pharos.observations.representation`. With one,
             measures of it are part of the report.
-        schedule: of the idealised learner that these have; rollouts: of the actor-critic; sampling: of the
-            one that draws.
+        schedule: of the idealised learner that these have. rollouts: of the actor-critic. sampling: of the learner that
+            draws.
         folder: for optimal values (`optimal.npy`, which `value_iteration(..., values=)` knows as well) and for the
             bounds of a diameter while they are computed, in place of memory: the same call goes on from them after one
             was killed, or a budget spent. None: memory, or, if that has little room, files without a name.
     Returns:
-        A Report. A measure that does not exist for this MDP says why; the others are there.
+        A Report. A measure that does not exist for this MDP says why. The others are there.
     Raises:
         UnknownName: no such measure. ParameterError: an option is out of range.
     Cost: see each measure.
@@ -288,8 +288,8 @@ class ResultsFile:
         self._has_warned = False
 
     def get(self, measure: Measure, budget: Budget) -> dict[str, Any] | None:
-        """Value, text, seconds and certificate; None if there is no result, or one that a larger budget could
-        improve on."""
+        """Value, text, seconds and certificate. None if there is no result, or one that a larger budget could improve
+        on."""
         if self.path is None or measure.version is None:
             return None
         key = self._key(measure)
@@ -358,7 +358,7 @@ class ResultsFile:
         return digest.hexdigest()
 
     def _read(self) -> dict[str, Any]:
-        """Entries by key; none if the file is missing, of another format, or damaged."""
+        """Entries by key. None if the file is missing, of another format, or damaged."""
         assert self.path is not None
         try:
             storage.check_regular(self.path)

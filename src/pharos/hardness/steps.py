@@ -34,7 +34,7 @@ HUGE_RETURN = 1e150
 
 
 def steps_of(name: str, mdp: TabularMDP, horizon: int | None) -> int:
-    """T: the argument, else the horizon of the MDP; UndefinedMeasure if there is neither."""
+    """T: the argument, else the horizon of the MDP. UndefinedMeasure if there is neither."""
     steps = mdp.horizon if horizon is None else horizon
     if steps is None:
         raise UndefinedMeasure(f"{name} is defined for episodes of T steps: give a horizon")
@@ -54,10 +54,10 @@ class FiniteHorizonValues:
     """Values at every step t = 1, ..., T (index t - 1) of optimal, worst and exploring play, on the nodes of an MDP.
 
     Attributes:
-        choices: the MDP written out; rewards (N, A); table (N, A) if each choice has one outcome, else None.
-        best, worst, explored: (T, N, A) action values; explored_value (T, N), clipped to [worst, best].
+        choices: the MDP written out. rewards: (N, A). table: (N, A) if each choice has one outcome, else None.
+        best, worst, explored: (T, N, A) action values. explored_value: (T, N), clipped to [worst, best].
         optimal: (T, N, A) bool.
-        sets: (N, A) bool, the available actions; None: all are everywhere. All are if an episode is over.
+        sets: (N, A) bool, the available actions. None: all are everywhere. All are if an episode is over.
         first: (N,) bool, the start nodes. num_visitable: states (pairs under sticky actions) that can be visited.
     """
 
@@ -181,15 +181,15 @@ def return_distribution(
     """Return the distribution of r_1 + ... + r_T under a policy, from the start, under every kind of chance.
 
     Args:
-        policy: as for `evaluate_policy`; None: uniform.
-        horizon: T; None: the MDP's.
+        policy: as for `evaluate_policy`. Default: uniform.
+        horizon: T. Default: the MDP's.
     Raises:
         UndefinedMeasure: there is no horizon, or there are so many different returns that a table of states by returns
             does not fit into 8 GiB.
         ParameterError: the policy or the horizon is wrong.
-    Exactness: exact; returns within 1e-9 of each other count as one. Of general MDPs the reward r(s, a) is paid as it
-        is, even if it is an expectation.
-    Cost: T passes over S A K, if K returns are possible; two tables of S A K.
+    Exactness: exact, but returns within 1e-9 of each other count as one. Of general MDPs the reward r(s, a) is paid as
+        it is, even if it is an expectation.
+    Cost: T passes over S A K, if K returns are possible, and two tables of S A K.
     Source: Bellemare, Dabney and Rowland (2023), "Distributional reinforcement learning", chapter 2.
     """
     steps = steps_of("return_distribution", mdp, horizon)

@@ -1,15 +1,15 @@
 """Diameter under chance: for every target a stochastic shortest path problem, most of them only as far as bounds need.
 
-`hitting_times` bounds the hitting times of one target; here the targets are chosen. A target whose upper bound falls
+`hitting_times` bounds the hitting times of one target. Here the targets are chosen. A target whose upper bound falls
 below the largest hitting time proven so far is dropped at once. Solved targets bound the others (`HubBounds`), so that
 there is an interval whenever the budget ends. If a look at each target would take longer than that, the target with
 the largest upper bound is always the next. So it is for the start eccentricity, whose first bounds are those from the
-start; solved targets are hubs for others as long as they rule some out.
+start. Solved targets are hubs for others as long as they rule some out.
 
 Upper bounds for all targets at once, from the solution of one of them (`HubBounds`). Let E(s, y) be the least expected
 number of steps from s to y, and h a hub with E(s, h) <= U(s) for all s. To go from x to y, choose an action a that may
 lead there. With probability P(s') it leads to s' != y instead. From there take a short way back to y if there is
-one, each of its steps in the same manner; else give up, and go to the hub. This attempt takes at most c(x, a, y)
+one, each of its steps in the same manner. Otherwise give up, and go to the hub. This attempt takes at most c(x, a, y)
 expected steps and is given up with probability at most l(x, a, y), where
 
     c(x, a, y) = 1 + sum over near s' of P(s') (sum of c along the way back) + sum over other s' of P(s') U(s')
@@ -75,75 +75,75 @@ SUM_SLACK = 1 + 1e-9
 
 
 class HubBounds:
-    """The bounds of an MDP; nodes are its states, and the implicit end if there is one.
+    """The bounds of an MDP. Nodes are its states, and the implicit end if there is one.
 
-    Cost: two searches of 64 nodes around each state, once; for a hub some passes over the ways back and one run of
+    Cost: two searches of 64 nodes around each state, once. For a hub some passes over the ways back and one run of
         Dijkstra's algorithm. Memory: some 30 bytes for each outcome of each action and a byte for each pair of outcomes
         of a state.
     """
 
     def __init__(self, mdp: TabularMDP, restart: bool):
         chance, num_actions = mdp.chance, mdp.num_actions
-        weights = (
+        self._execution = hitting.ExecutionWeights(
             chance.chosen,
             chance.previous,
             chance.uniform / num_actions,
             chance.first_chosen,
             chance.first_uniform / num_actions,
+            mdp.policy_width - 1,
+            num_actions,
         )
         self._outcomes = _outcome_lists(mdp, restart)
-        first, _, node, _ = self._outcomes
-        owner = np.repeat(np.arange(len(first) - 1), np.diff(first))
-        self._num_actions = num_actions
+        size = len(self._outcomes.node)
+        self._num_nodes = len(self._outcomes.first) - 1
         self._steps = -1, np.empty(0, np.int32)  # a hub, and those from it to each node
-        self._fixed = (self._outcomes, owner, weights, mdp.policy_width - 1)
-        self._threads = usable_workers(None) if len(node) > FEW_OUTCOMES else 1
+        self._threads = usable_workers(None) if size > FEW_OUTCOMES else 1
         with ThreadPoolExecutor(self._threads) as pool:
-            self._find_ways_back(owner, pool)
-        self.leak = self._solve(0.0, np.ones(len(first) - 1))
+            self._find_ways_back(pool)
+        self.leak = self._solve(0.0, np.ones(self._num_nodes))
 
-    def _find_ways_back(self, owner: np.ndarray, pool: ThreadPoolExecutor) -> None:
-        first, _, node, _ = self._outcomes
-        size = len(first) - 1
+    def _find_ways_back(self, pool: ThreadPoolExecutor) -> None:
+        first, _, node, _, owner = self._outcomes
         counts = np.diff(first)[owner]
         used = (counts <= SQUARE) & (owner != node)
         ends = np.cumsum(np.where(used, counts, 0))
         square = np.where(used, ends - counts, -1)
         steps = np.empty(int(ends[-1]) if len(ends) else 0, np.uint8)
-        into = hitting.outcomes_into(node, size)
-        dtype = np.int32 if len(node) < 2**31 else np.int64
-        edges = np.linspace(0, size, self._threads + 1).astype(np.int64)
+        into = hitting.outcomes_into(node, self._num_nodes)
+        edges = np.linspace(0, self._num_nodes, self._threads + 1).astype(np.int64)
+        size, index_type = self._num_nodes, np.int32 if len(node) < 2**31 else np.int64
         room = [
-            (np.zeros(size, np.uint8), np.empty(NEARBY, np.int64), np.empty(size, dtype)) for _ in range(self._threads)
+            (np.zeros(size, np.uint8), np.empty(NEARBY, np.int64), np.empty(size, index_type))
+            for _ in range(self._threads)
         ]
 
-        def all_nodes(start: np.ndarray | None, way: np.ndarray | None) -> None:
-            def part(thread: int) -> None:
-                low, high = edges[thread], edges[thread + 1]
-                arrays = (self._outcomes, owner, into, square, steps, start, way, NEARBY, *room[thread])
-                hitting.ways_back(low, high, *arrays)
+        def write(ways: hitting.Ways) -> None:
+            def part(low: int, high: int, own: tuple[np.ndarray, ...]) -> None:
+                hitting.ways_back(low, high, self._outcomes, into, ways, own)
 
-            list(pool.map(part, range(self._threads)))
+            list(pool.map(part, edges[:-1], edges[1:], room))
 
-        all_nodes(None, None)
+        self._ways = hitting.Ways(square, steps, np.empty(0, np.int64), np.empty(0, index_type))
+        write(self._ways)
         length = np.empty(len(node), np.int64)
-        self._rho = hitting.keep_near(*self._fixed, square, steps, LIMIT, length)
-        start = np.cumsum(length) - length
-        way = np.empty(int(length.sum()), dtype)
-        all_nodes(start, way)
-        self._ways = (square, steps, start, way)
+        self._rho = hitting.keep_near(self._outcomes, self._execution, self._ways, LIMIT, length)
+        way = np.empty(int(length.sum()), index_type)
+        self._ways = hitting.Ways(square, steps, np.cumsum(length) - length, way)
+        write(self._ways)
 
     def _solve(self, own: float, times: np.ndarray) -> np.ndarray:
-        """(outcomes,) c for own = 1 and times = U; l for own = 0 and times = 1."""
-        value = np.full(len(self._fixed[1]), own)
+        """(outcomes,) c for own = 1 and times = U, and l for own = 0 and times = 1."""
+        value = np.full(len(self._outcomes.node), own)
         new = value.copy()
         edges = np.linspace(0, len(value), self._threads + 1).astype(np.int64)
+        outcomes, execution, ways = self._outcomes, self._execution, self._ways
         with ThreadPoolExecutor(self._threads) as pool:
             for passes in range(PASSES):
                 # twice with all arrays, as two take turns
-                arrays: tuple[object, ...] = (*self._fixed, *self._ways, own, times, value, new, passes < 2)
+                values, is_first = (own, times, value, new), passes < 2
                 parts = [
-                    pool.submit(hitting.attempt_costs, low, high, *arrays) for low, high in itertools.pairwise(edges)
+                    pool.submit(hitting.attempt_costs, low, high, outcomes, execution, ways, values, is_first)
+                    for low, high in itertools.pairwise(edges)
                 ]
                 short = max(part.result() for part in parts)
                 if short <= ACCURACY * (1 - self._rho):
@@ -154,7 +154,7 @@ class HubBounds:
     def times_from(self, hub: int, times: np.ndarray) -> np.ndarray:
         """(N,) V: upper bounds of the expected steps from the hub to each node, given those from each node to the
         hub."""
-        first, _, node, _ = self._outcomes
+        first, node = self._outcomes.first, self._outcomes.node
         return hitting.times_from(hub, first, node, self._solve(1.0, times), self.leak) * SUM_SLACK
 
     def shortened(
@@ -166,56 +166,49 @@ class HubBounds:
             times, bound: (N,) upper bounds of the expected steps to the hub, and from it.
             targets: those whose bounds are to be shortened.
             size: nodes around each of them.
-            is_over: whether to leave the rest as it is; asked between parts.
+            is_over: whether to leave the rest as it is, asked between parts.
         Cost: for each of the targets some passes over `size` nodes.
         """
-        outcomes, owner, weights, num_previous = self._fixed
-        num_nodes = len(outcomes[0]) - 1
         room = [
             (
-                np.zeros(num_nodes, np.int32),
+                np.zeros(self._num_nodes, np.int32),
                 np.empty(size, np.int64),
                 np.empty((4 * size, 2), np.int64),
                 np.empty(hitting.MOST_TURNS, np.int64),
-                *np.empty((2, size, num_previous + 1)),
+                *np.empty((2, size, self._execution.num_previous + 1)),
             )
             for _ in range(self._threads)
         ]
-        bound, new = bound.copy(), np.empty(num_nodes)
-        graph = (outcomes, owner, self._into, self._steps_from(int(np.argmin(bound))))
-        chance = (weights, num_previous, self._num_actions)
-        fixed = (graph, chance, times, bound, new, WAY_ROUNDS)
+        bound, new = bound.copy(), np.empty(self._num_nodes)
+        hub = (self._steps_from(int(np.argmin(bound))), times, bound, new)
+        fixed = (self._outcomes, self._into, self._execution, hub, WAY_ROUNDS)
         with ThreadPoolExecutor(self._threads) as pool:
             order = targets[np.argsort(bound[targets], kind="stable")]
             for part in np.array_split(order, min(TARGET_PARTS, max(len(order), 1))):
                 if is_over():
                     break
-                edges = np.linspace(0, len(part), self._threads + 1).astype(np.int64)
-                tasks = [
-                    pool.submit(hitting.shorten, part, low, high, *fixed, own)
-                    for own, low, high in zip(room, edges[:-1], edges[1:], strict=True)
-                ]
-                for task in tasks:
-                    task.result()
+                list(
+                    pool.map(
+                        lambda some, own: hitting.shorten(some, *fixed, own), np.array_split(part, self._threads), room
+                    )
+                )
                 bound[part] = new[part]
         return bound
 
     @cached_property
     def _into(self) -> tuple[np.ndarray, np.ndarray]:
-        """Outcomes that lead to each node, a large table; computed on demand, as only shortening needs it."""
-        first, _, node, _ = self._outcomes
-        return hitting.outcomes_into(node, len(first) - 1)
+        """Outcomes that lead to each node, a large table. It is computed on demand, as only shortening needs it."""
+        return hitting.outcomes_into(self._outcomes.node, self._num_nodes)
 
     def _steps_from(self, hub: int) -> np.ndarray:
-        """(N,) int32, see `vicinity.steps_from`; the last ones are kept, as rounds of shortening have one hub."""
+        """(N,) int32, see `hitting.steps_from`. The last ones are kept, as rounds of shortening have one hub."""
         if hub != self._steps[0]:
-            first, _, node, _ = self._outcomes
-            self._steps = hub, hitting.steps_from(hub, first, node)
+            self._steps = hub, hitting.steps_from(hub, self._outcomes.first, self._outcomes.node)
         return self._steps[1]
 
 
-def _outcome_lists(mdp: TabularMDP, restart: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(first, action, node, probability) of the outcomes of executing each action in each state; action -1: any."""
+def _outcome_lists(mdp: TabularMDP, restart: bool) -> hitting.OutcomeLists:
+    """The outcomes of executing each action in each state, and of ending an episode, by any action."""
     terminal = np.asarray(mdp.terminal)
     executed, ends = outcome_matrix(mdp, terminal)
     num_states, num_actions = mdp.num_states, mdp.num_actions
@@ -235,7 +228,7 @@ def _outcome_lists(mdp: TabularMDP, restart: bool) -> tuple[np.ndarray, np.ndarr
         prob[indices] = np.tile(np.asarray(mdp.start_probabilities)[starts], len(ended))
     rows = np.repeat(np.arange(num_states * num_actions), np.diff(executed.indptr))
     action[of_live], node[of_live], prob[of_live] = rows % num_actions, executed.indices, executed.data
-    return first, action, node, prob
+    return hitting.OutcomeLists(first, action, node, prob, np.repeat(np.arange(len(counts)), counts))
 
 
 # Diameter -------------------------------------------------------------------------------------------------------------
@@ -278,9 +271,9 @@ class TargetBounds:
 
     Attributes:
         farther: the words for a target that may exceed it.
-        upper: (targets,) of the time to each; -inf if it is settled.
+        upper: (targets,) of the time to each, -inf if it is settled.
         lower: the largest time that is proven. settled_upper: the largest upper bound of settled targets.
-        limited: targets whose bounds are as close as floats allow, and no closer than the tolerance.
+        limited: number of targets whose bounds cannot reach the tolerance in float64.
     """
 
     farther: str
@@ -470,7 +463,7 @@ class _Diameter(TargetBounds):
     def _solved(
         self, targets: HittingTimes, some: Sequence[int], enough: float, scaling: bool, bounding: bool
     ) -> "list[_TargetResult]":
-        """Solve each of `some`; one with an upper bound of at most `enough` no further than that."""
+        """Solve each of `some`. A target with an upper bound of at most `enough` is solved no further."""
         looks = []
         for target in some:
             j, count, lost = targets.open(target)
@@ -513,7 +506,7 @@ class _TargetResult:
     """Result for a target: bounds of its largest hitting time, and how many states do not surely reach it.
 
     Attributes:
-        limited: whether floats allow no closer bounds.
+        limited: whether the bounds cannot reach the tolerance in float64.
         scale: 99th percentile of hitting time divided by distance.
         times: (nodes,) upper bounds of the hitting times, if other targets are to be bounded.
     """
@@ -582,7 +575,7 @@ class _Eccentricity(TargetBounds):
         self.spending.report(self.lower, max(self.settled_upper, float(self.upper.max())), self.num_open)
 
     def _settle(self, target: int) -> np.ndarray | None:
-        """Settle a target; returns upper bounds (nodes,) of its hitting times, if all are known."""
+        """Settle a target. Returns upper bounds (nodes,) of its hitting times, if all are known."""
         targets, rounding = self.targets, 1 + (len(self.nodes) + 8) * UNIT
         self.spending.searches += 1
         before, self.upper[target] = float(self.upper[target]), -math.inf

@@ -16,7 +16,7 @@ traffic goes by, all edges of H lead from one layer {v: d(s, v) = j modulo P} to
 many targets then stand in one layer if each begins when the layer of its target has its turn
 (`kernels.search_in_step`): that one layer is read for all targets, while levels, counted from each target, are as many
 layers as targets have. They end after as many steps as the other way has. Restarts, which lead from all layers to the
-first, make the common length of cycles 1 and would spread every search over all layers; in H they do not exist.
+first, make the common length of cycles 1 and would spread every search over all layers. In H they do not exist.
 """
 
 import math
@@ -35,11 +35,11 @@ from pharos.system.wording import pluralize
 
 
 class Graph:
-    """The graph of a deterministic MDP, with restart edges and the implicit end; see `pharos.kernels.graph`.
+    """The graph of a deterministic MDP, with restart edges and the implicit end, see `pharos.kernels.graph`.
 
     Attributes:
         num_nodes: N, the states and, if some transition of a state that is not terminal is -1, the end.
-        start: the node that terminal states lead to; -1: they lead nowhere.
+        start: the node that terminal states lead to. -1: they lead nowhere.
         pivot: a start state, at which searches begin.
     """
 
@@ -55,7 +55,7 @@ class Graph:
 
     @staticmethod
     def of(mdp: TabularMDP, restart: bool) -> "Graph | None":
-        """The graph of `mdp`; None if a choice or a restart has several outcomes."""
+        """The graph of `mdp`, or None if a choice or a restart has several outcomes."""
         if not mdp.chance.is_none:
             return None
         table = mdp.dynamics.deterministic_table()
@@ -79,16 +79,16 @@ class Graph:
         return self._reversed
 
     def search_forward(self, source: int, distance: np.ndarray) -> tuple[int, int, int]:
-        """Set distance[v] to d(source, v); return (nodes found, largest distance, sum of distances)."""
+        """Set distance[v] to d(source, v). Return (nodes found, largest distance, sum of distances)."""
         return kernels.search((self.next_states, self.ends), None, self.start, source, distance, self.queue)
 
     def search_backward(self, source: int, distance: np.ndarray) -> tuple[int, int, int]:
-        """Set distance[v] to d(v, source); return (nodes found, largest distance, sum of distances)."""
+        """Set distance[v] to d(v, source). Return (nodes found, largest distance, sum of distances)."""
         return kernels.search(None, self.backward, self.start, source, distance, self.queue)
 
 
 def _leads_to_end(table: Indices, terminal: np.ndarray) -> bool:
-    """Whether a row that is followed holds -1; in blocks, for tables that are larger than memory."""
+    """Whether a row that is followed holds -1. In blocks, for tables that are larger than memory."""
     block = 1 << 20
     for low in range(0, len(table), block):
         rows = table[low : low + block]
@@ -155,7 +155,7 @@ class HiddenClock(NamedTuple):
     """The layers of a graph without its restarts.
 
     Attributes:
-        home: (N,) steps to the start; away: (N,) steps from it.
+        home: (N,) steps to the start. away: (N,) steps from it.
         layers: of the nodes, by `away` modulo P.
     """
 
@@ -165,7 +165,7 @@ class HiddenClock(NamedTuple):
 
     @staticmethod
     def of(graph: Graph, home: np.ndarray, away: np.ndarray) -> "HiddenClock | None":
-        """The clock of a graph with restarts; None if there is none, or its layers do not pay.
+        """The clock of a graph with restarts. None if there is none, or its layers do not pay.
 
         Args:
             home, away: (N,) distances to the start, and from it.
@@ -183,7 +183,7 @@ class HiddenClock(NamedTuple):
         return HiddenClock(home.copy(), away.copy(), GraphLayers.of(layer, widths, graph.dtype))
 
     def largest_to(self, graph: Graph, targets: np.ndarray, best: int) -> tuple[np.ndarray, int]:
-        """((targets,) max over u of d(u, target), or `best` if that is larger; table entries read)."""
+        """((targets,) max over u of d(u, target), or `best` if that is larger, table entries read)."""
         cycle = self.layers.number
         of_target = self.away[targets] % cycle
         order = np.argsort(-of_target, kind="stable")
@@ -237,7 +237,7 @@ class SumSweep:
     """Bounds on all eccentricities, tightened by searches until one side leaves no node that could be farther.
 
     out(v) = max over w of d(v, w), in(v) = max over w of d(w, v). From d(v, w) <= d(v, p) + d(p, w) follow
-    out(v) <= d(v, p) + out(p) and in(v) <= in(p) + d(p, v) for a pivot p searched in both directions; a search from w
+    out(v) <= d(v, p) + out(p) and in(v) <= in(p) + d(p, v) for a pivot p searched in both directions. A search from w
     in one direction gives out(w) or in(w) exactly, and a lower bound for everyone. D = max out = max in: it is proven
     as soon as no out(v), or no in(v), can exceed the largest eccentricity found.
     """
@@ -282,7 +282,7 @@ class SumSweep:
     # Searches ---------------------------------------------------------------------------------------------------------
 
     def _pivot(self, p: int) -> bool:
-        """Search from p in both directions; False if p does not reach all nodes, or not all reach p."""
+        """Search from p in both directions. False if p does not reach all nodes, or not all reach p."""
         forward, out_pivot, _ = self.graph.search_forward(p, self.away)
         backward, in_pivot, _ = self.graph.search_backward(p, self.to)
         self.spending.searches += 2
@@ -373,7 +373,7 @@ class SumSweep:
         return nodes[np.argsort(-upper[nodes].astype(np.int64), kind="stable")[: self._limit(words)]]
 
     def _search_many(self, outward: bool, words: int) -> int:
-        """Find the eccentricities of the open nodes of largest upper bounds; return table entries read, times words."""
+        """Find the eccentricities of the open nodes of largest upper bounds. Return table entries read, times words."""
         graph = self.graph
         upper, lower = (self.out_upper, self.out_lower) if outward else (self.in_upper, self.in_lower)
         nodes = np.sort(self._farthest(upper, words))
@@ -391,12 +391,12 @@ class SumSweep:
         return int(reads) * (1 + words)
 
     def _search_densely(self) -> int:
-        """Find the exact in(v) of up to 512 open nodes, and bounds along edges; return the cost, in table entries.
+        """Find the exact in(v) of up to 512 open nodes, and bounds along edges. Return the cost, in table entries.
 
-        If most eccentricities are nearly equal, as in puzzles whose moves can be taken back, no pivot rules many
-        nodes out; but a node with in(u) < D does so for its successors, as in(v) <= 1 + in(u). So none of the nodes is
-        a successor of another one, and those with many successors come first: they lie in the middle and close most.
-        A line that is pulled takes an eighth of the time of one that is pushed (512 nodes of the 8-puzzle: 0.25 s in
+        If most eccentricities are nearly equal, as in puzzles whose moves can be taken back, no pivot rules many nodes
+        out. But a node with in(u) < D does so for its successors, as in(v) <= 1 + in(u). So none of the nodes is a
+        successor of another one, and those with many successors come first: they lie in the middle and close most. A
+        line that is pulled takes an eighth of the time of one that is pushed (512 nodes of the 8-puzzle: 0.25 s in
         place of 2.8 s).
         """
         graph = self.graph
@@ -464,10 +464,10 @@ class SumSweep:
 
         Claim: if g < P then D = P + g. At most: for all u and v one of g + 1, ..., g + P is the difference of their
         layers modulo P, and R of that many steps is whole, so d(u, v) <= g + P. At least, for g >= 0: let v be missing
-        in R_g(u). All walks from u to v have a length of g modulo P; g itself is none, and as g < P nothing smaller is,
+        in R_g(u). All walks from u to v have a length of g modulo P. g itself is none, and as g < P nothing smaller is,
         so d(u, v) >= g + P. For g = -1 every layer is one node and the graph is a cycle of P nodes: D = P - 1.
 
-        The sets are found for one layer at a time, a bit for each of its nodes; this pays if layers are narrow.
+        The sets are found for one layer at a time, a bit for each of its nodes. This pays if layers are narrow.
         """
         graph = self.graph
         if graph.num_nodes < 64:
@@ -537,17 +537,17 @@ _CANDIDATES, _IN_VAIN = 200, 3
 def orbits(
     next_states: Indices, ends: np.ndarray, start: int, pivot: int, is_over: Callable[[], bool]
 ) -> np.ndarray | None:
-    """Return (S,) integers: for each state the smallest one of its orbit; None if no symmetry was found.
+    """Return (S,) integers: for each state the smallest one of its orbit. None if no symmetry was found.
 
-    A symmetry maps the states onto each other so that every action does the same; it keeps all distances. There are
+    A symmetry maps the states onto each other so that every action does the same. It keeps all distances. There are
     many if states can be renamed, as the tiles of a tray, or the positions of a cube without an end. The image of
     one state decides it, so that it takes one pass over the table at most, and mostly a few steps, to find the symmetry
     that takes `pivot` to a state drawn at random, or that there is none.
 
     Args:
-        next_states, ends: (S, A), -1 leads to the end; (S,) the states that end the episode. All must be within reach
+        next_states: (S, A), -1 leads to the end. ends: (S,) the states that end the episode. All must be within reach
             of `pivot`.
-        start: the state to which those lead that end the episode; -1: nowhere.
+        start: the state to which states lead that end the episode. -1: nowhere.
         is_over: whether to stop looking for more.
     Cost: at most four passes over the table for maps that fail, one for each that is found. Without symmetries mostly
         some thousand entries are read, and no more memory is touched: the scratch arrays are zero pages until then.

@@ -21,10 +21,10 @@ from pharos.mdp import (
     require_mdp,
 )
 from pharos.solvers import Solution
+from pharos.system.arrays import UNIT_ROUNDOFF
 
 # States at once: values of all their outcomes are in memory.
 _VARIANCE_BLOCK = 1 << 16
-_UNIT = 2.0**-53
 # Relative width up to which an interval counts as the value.
 _NARROW = 1e-6
 
@@ -35,15 +35,15 @@ def environmental_value_norm(mdp: TabularMDP, solution: Solution | None = None) 
 
         max over s, a of sqrt(Var(V*(s') : s' ~ p(. | s, a)))
 
-    over the states that can be reached; 0 for deterministic MDPs. Under sticky actions s is a pair (state, previously
+    over the states that can be reached. 0 for deterministic MDPs. Under sticky actions s is a pair (state, previously
     executed action), and so is s'. With a horizon, V* belongs to the first step.
 
     Args:
-        solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9, or what floats reach.
+        solution: the optimal solution of `mdp`. Default: solved here to an error of 1e-9, or what floats reach.
     Raises:
         ParameterError: `solution` belongs to another MDP or is not optimal.
     Exactness: `certified_value_norm` returns the interval that follows from the error of the values.
-    Cost: one pass over the table; 20 to 100 ns a state.
+    Cost: one pass over the table, 20 to 100 ns a state.
     Source: Maillard, Mann and Mannor (2014), definition 1. (Colosseum centres with the expectation of another state: a
         slip.)
     """
@@ -53,7 +53,7 @@ def environmental_value_norm(mdp: TabularMDP, solution: Solution | None = None) 
 def certified_value_norm(
     mdp: TabularMDP, solution: Solution | None = None, *, progress: Callable[[str], object] = str
 ) -> Certified:
-    """Return `environmental_value_norm` with its interval; `progress` is called with a line for each block of states.
+    """Return `environmental_value_norm` with its interval. `progress` is called with a line for each block of states.
 
     A standard deviation changes by no more than the values do. Every variance is a sum of squares of values less their
     mean, in the row of one state, so that large values that lie close together lose no digits.
@@ -80,7 +80,7 @@ def certified_value_norm(
             here = mdp.chance.at(block[is_node]), means[is_node], within[is_node]
             largest = max(largest, _largest_variance(*here, previous))
     value = math.sqrt(largest) * scale
-    error = solution.error_bound + (3 * mdp.num_actions + mdp.dynamics.operations + 16) * _UNIT * size
+    error = solution.error_bound + (3 * mdp.num_actions + mdp.dynamics.operations + 16) * UNIT_ROUNDOFF * size
     lower, upper = max(0.0, value - error), value + error
     return Certified(value, lower, upper, upper - lower <= _NARROW * upper or upper == 0.0)
 
@@ -124,7 +124,7 @@ class ActionGapRegularity:
     """Distribution of the action gap g(s) = V*(s) - max over actions that are not optimal of Q*(s, a).
 
     Attributes:
-        constant: the smallest c with P(0 < g(s) <= t) <= c t^zeta for all t > 0; 0 if there are no gaps.
+        constant: the smallest c with P(0 < g(s) <= t) <= c t^zeta for all t > 0. 0 if there are no gaps.
         zeta: the exponent.
         gaps: (K,) the different gaps, ascending.
         shares: (K,) P(0 < g(s) <= gaps[i]).
@@ -164,15 +164,15 @@ def action_gap_regularity(
 
         g(s) = V*(s) - max over a with V*(s) - Q*(s, a) > tie_tolerance of Q*(s, a)
 
-    s is uniform over the states that `gaps` counts: those that can be reached and are not terminal; under sticky
-    actions pairs with the previously executed action; with a horizon the states of every step.
+    s is uniform over the states that `gaps` counts: states that can be reached and are not terminal. Under sticky
+        actions they are pairs with the previously executed action, with a horizon the states of every step.
 
     Args:
-        solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9, or what floats reach.
+        solution: the optimal solution of `mdp`. Default: solved here to an error of 1e-9, or what floats reach.
         zeta: the exponent, above 0 or 0.
         tie_tolerance: as for `gaps`.
     Raises:
-        ParameterError: zeta is negative or no number; PrecisionError: as for `gaps`.
+        ParameterError: zeta is negative or no number. PrecisionError: as for `gaps`.
     Exactness: gaps are known up to twice the error bound of the solution.
     Cost: as `gaps`, and a sort.
     Source: Farahmand (2011), "Action-gap phenomenon in reinforcement learning", assumption A1, for any number of

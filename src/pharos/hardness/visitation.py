@@ -54,8 +54,8 @@ class Occupancy:
         visits: (S, A) float64, the sum over t of gamma^t mu_t(s, a), t = 0, 1, ...
         largest: (S, A) float64, the maximum over t of mu_t(s, a), without discount.
         steps: t that were gone through.
-        error_bound: the entries of `visits` lack no more than this together; 0 with a horizon.
-        by_step: (T, S, A), mu_t(s, a), if all were asked for; else None.
+        error_bound: the entries of `visits` lack no more than this together. 0 with a horizon.
+        by_step: (T, S, A), mu_t(s, a), if all were asked for, else None.
         conventions: gamma, horizon, and whether actions are chosen or executed ones.
     """
 
@@ -107,17 +107,18 @@ def occupancy(
 
     Args:
         policy: as for `evaluate_policy`: (S,) actions, (S, A) probabilities, under sticky actions also one for each
-            previous action; None: uniform.
-        horizon: T, steps t = 0, ..., T - 1; None: the MDP's; if it has none, until what is left is within
+            previous action. Default: uniform.
+        horizon: T, steps t = 0, ..., T - 1. Default: the MDP's. If it has none, until what is left is within
             `tolerance`.
-        executed: whether a_t is the action that is executed, after chance; otherwise the one that the policy chooses.
+        executed: whether a_t is the action that is executed, after chance. Otherwise the action that the policy
+            chooses.
         keep_all: whether to keep mu_t for all t, with a horizon.
         tolerance: of the sum of all visits, without a horizon.
-        progress: called with a line now and then; an exception of its own ends the computation.
+        progress: called with a line now and then. An exception that it raises ends the computation.
     Raises:
         UndefinedMeasure: gamma is 1 and there is no horizon, so that visits may be infinite.
         ParameterError: the policy or an option is wrong, or all steps would take more than 8 GiB.
-    Cost: O(S A) a step and O(S A) memory; without a horizon about ln(1 / tolerance) / (1 - gamma) steps. 100 steps on
+    Cost: O(S A) a step and O(S A) memory. Without a horizon about ln(1 / tolerance) / (1 - gamma) steps. 100 steps on
         the 2.4 million states of `breakout/12x8x1` take 0.8 s.
     Source: Puterman (1994), section 6.9; Laidlaw, Russell and Dragan (2023) for mu_t.
     """
@@ -159,7 +160,7 @@ def occupancy(
 def discounted_visits(
     mdp: TabularMDP, policy: TablePolicy | None = None, *, tolerance: float = 1e-9
 ) -> tuple[np.ndarray, float]:
-    """Return the visits of states without a horizon, from below, and what they may lack together.
+    """Return discounted state visits without a horizon, from below, and a bound on the mass that was cut off.
 
         d(s) = sum over t of gamma^t P(s_t = s),   t = 0, 1, ...
 
@@ -169,11 +170,11 @@ def discounted_visits(
     Args:
         policy, tolerance: as for `occupancy`.
     Returns:
-        (S,) float64, and the bound; it is above `tolerance` only if all that is left has less than 1e-280 in each
+        (S,) float64, and the bound. It is above `tolerance` only if all that is left has less than 1e-280 in each
         state.
     Raises:
         UndefinedMeasure: gamma is 1. ParameterError: the policy is wrong.
-    Cost: O(S A) a pass; at most ln(1 / tolerance) / (1 - gamma) passes, in breadth-first order a tenth of them and
+    Cost: O(S A) a pass, at most ln(1 / tolerance) / (1 - gamma) passes, in breadth-first order a tenth of them and
         fewer.
     """
     walk = Propagation(mdp if mdp.horizon is None else mdp.with_horizon(None), policy, None)
@@ -188,14 +189,13 @@ def discounted_arrivals(
     tolerance: float = 1e-9,
     report: Callable[[str], object] = str,
 ) -> tuple[np.ndarray, float]:
-    """Return the visits of states without a horizon, in terminal states and the end by arrival; and what they may lack
-    together.
+    """Return discounted state visits and a bound on the mass that was cut off. Terminal states count on arrival.
 
         d(s) = sum over t of gamma^t P(s_t = s), times 1 - gamma if s is terminal or the end, which is never left
 
     Args, cost, errors: as for `discounted_visits`.
     Returns:
-        (S + 1,) float64, entry S for the end; and the bound.
+        (S + 1,) float64, entry S for the end, and the bound.
     """
     walk = Propagation(mdp if mdp.horizon is None else mdp.with_horizon(None), policy, None)
     started, visits, left = walk.discounted(tolerance, report)
@@ -219,7 +219,7 @@ def support_with_ends(mdp: TabularMDP, policy: TablePolicy | None = None) -> np.
         policy: as for `occupancy`.
     Raises:
         ParameterError: the policy is wrong.
-    Cost: O(S A); with transitions as a matrix that for each step to the last state that is met.
+    Cost: O(S A). With transitions as a matrix, O(S A) for each step to the last state that is met.
     """
     walk = Propagation(mdp, policy, 1)
     started, is_visited = walk.after_the_start()
@@ -255,7 +255,8 @@ class Propagation:
         self.width = mdp.width
 
     def after_the_start(self) -> tuple[np.ndarray, np.ndarray]:
-        """((S,), (S, W)): under sticky actions the mass of the start, and that one step later; else 0, and the start.
+        """((S,), (S, W)): under sticky actions the mass of the start, and the mass one step later. Otherwise 0, and the
+        start.
 
         The second is the first mass that moves by the rules of later steps. Without states in which play ends.
         """
@@ -278,8 +279,8 @@ class Propagation:
     def discounted(
         self, tolerance: float, report: Callable[[str], object] = str
     ) -> tuple[np.ndarray, np.ndarray, float]:
-        """((S,), (S, W), bound): discounted visits of the first step, under sticky actions alone; of the others; and a
-        bound on the visits that are missing."""
+        """((S,), (S, W), bound): discounted visits of the first step, under sticky actions alone, visits of the others,
+        and a bound on the visits that are missing."""
         started, waiting = self.after_the_start()
         gamma = self.mdp.gamma
         waiting *= gamma if self.mdp.is_sticky else 1.0
@@ -292,7 +293,7 @@ class Propagation:
             before = left
 
     def distributions(self) -> Iterator[tuple[np.ndarray, bool, float]]:
-        """(mass, whether it is the first step, probability that play goes on) at t = 0, 1, ...; T with a horizon.
+        """(mass, whether it is the first step, probability that play goes on) at t = 0, 1, ..., up to T with a horizon.
 
         mass is (S, 1), or under sticky actions after the first step (S, A), by the previously executed action. Each is
         overwritten by later ones.
@@ -330,8 +331,8 @@ class StandardOccupancy:
     """Optimal values of the learner's discount, and weights of states.
 
     Attributes:
-        states: (S,) weights that sum to 1; 0 for terminal states.
-        q: (S, A) optimal values without a horizon; under sticky actions of executing an action.
+        states: (S,) weights that sum to 1, 0 for terminal states.
+        q: (S, A) optimal values without a horizon. Under sticky actions, of executing an action.
     """
 
     states: np.ndarray
@@ -344,7 +345,7 @@ def standard_occupancy(
     """The mean of the undiscounted occupancies of uniform play and of optimal play over episodes of some steps.
 
     Args:
-        gamma: the learner's discount, of the values that optimal play follows; its ties are chosen alike.
+        gamma: the learner's discount, of the values that optimal play follows. Its ties are chosen alike.
         report: called with a line for each sweep of values and each step of play.
     """
 
@@ -377,7 +378,7 @@ class ExplorationTime:
     """Expected time until uniform play finds a large reward.
 
     Attributes:
-        steps: expected, episodes after episodes; infinite if it never does.
+        steps: expected, over one episode after another. Infinite if it never does.
         episodes: expected, the one in which it happens included: 1 / probability.
         probability: that an episode has one.
         threshold: a reward above it is large.
@@ -409,12 +410,12 @@ def exploration_time(
     rewards are costs alone, above the middle between the smallest and the largest.
 
     Args:
-        horizon: steps of an episode; None: the MDP's.
-        progress: called with a line now and then; an exception of its own ends the computation.
+        horizon: steps of an episode. Default: the MDP's.
+        progress: called with a line now and then. An exception that it raises ends the computation.
     Raises:
         UndefinedMeasure: there are no episodes, or all rewards are costs of one size.
     Cost: O(S A) a step.
-    Source: pharos; goal-finding by random walk, as in Koenig and Simmons (1996).
+    Source: pharos. Goal-finding by random walk is as in Koenig and Simmons (1996).
     """
     steps = steps_of("exploration_time", mdp, horizon)
     rewards, live = mdp.rewards, ~np.asarray(mdp.terminal)
@@ -488,12 +489,12 @@ def covering(
         mu_t(s, a) = P(s_t = s, a_t = a) for uniform play from the start;  L <= ln(2 S A) / min over s, a of max over t
         of mu_t(s, a); if actions are not available everywhere, S A is the number of pairs that there are
 
-    Pairs run over the states that can be met within T steps and are not terminal; under sticky actions over pairs
+    Pairs run over the states that can be met within T steps and are not terminal, under sticky actions over pairs
     (state, previously executed action), and a start without one.
 
     Args:
-        horizon: T; None: the MDP's.
-        progress: called with a line now and then; an exception of its own ends the computation.
+        horizon: T. Default: the MDP's.
+        progress: called with a line now and then. An exception that it raises ends the computation.
     Raises:
         UndefinedMeasure: there is no horizon.
     Cost: O(S A) for each of the T steps, and O(S) memory, under sticky actions O(S A). 200 steps on the 2.4 million
@@ -544,8 +545,8 @@ class MixingTime:
     """Mixing time of a policy: steps until it has forgotten its start.
 
     Attributes:
-        value: t_mix in steps; infinite if the chain does not converge.
-        period: of the recurrent class; 0 if there are several.
+        value: t_mix in steps, infinite if the chain does not converge.
+        period: of the recurrent class, 0 if there are several.
         distance: the total variation distance at t_mix.
         conventions: epsilon, restart, policy, nodes.
     """
@@ -556,7 +557,7 @@ class MixingTime:
     conventions: dict[str, Any] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able; an infinite time is None."""
+        """JSON-able, with None for an infinite time."""
         value = {"value": finite(self.value), "infinite": math.isinf(self.value)}
         return {**value, **fields_of(self, "value", "conventions"), **self.conventions}
 
@@ -581,13 +582,13 @@ def mixing_time(
         t_mix = min t with max over s of 1/2 sum over s' of |P^t(s, s') - mu(s')| <= epsilon,   mu P = mu
 
     Args:
-        policy: as for `evaluate_policy`; None: uniform.
+        policy: as for `evaluate_policy`. Default: uniform.
         epsilon: in (0, 1/2).
         restart: an action in a terminal state leads back to the start, as for the diameter.
         lazy: of the chain (I + P) / 2, which has no period.
-        progress: called with a line now and then; an exception of its own ends the computation.
+        progress: called with a line now and then. An exception that it raises ends the computation.
     Returns:
-        A MixingTime; infinite if the chain has a period, or several recurrent classes.
+        A MixingTime, infinite if the chain has a period or several recurrent classes.
     Raises:
         UndefinedMeasure: there are more than 4096 nodes (states, under sticky actions pairs with the previous action).
         ParameterError: an option or the policy is wrong.
@@ -646,7 +647,7 @@ def _too_large_for_matrix(nodes: int) -> str:
 
 
 def _period(chain: "csr_matrix") -> int:
-    """The period of the recurrent class; 0 if there are several."""
+    """The period of the recurrent class, 0 if there are several."""
     count, labels = scipy.sparse.csgraph.connected_components(chain, directed=True, connection="strong")
     rows, columns = chain.nonzero()
     leaves = np.zeros(count, np.bool_)
@@ -713,18 +714,18 @@ def distribution_mismatch(
     result is at least 1.
 
     Args:
-        policy: as for `evaluate_policy`; None: uniform.
-        solution: the optimal solution of `mdp`; None: solved here to an error of 1e-9, or what floats reach.
+        policy: as for `evaluate_policy`. Default: uniform.
+        solution: the optimal solution of `mdp`. Default: solved here to an error of 1e-9, or what floats reach.
         tolerance: of the sums of d and of d*.
-        progress: called with a line now and then; an exception of its own ends the computation.
+        progress: called with a line now and then. An exception that it raises ends the computation.
     Returns:
         An interval: it is wide if d(s) is not much larger than `tolerance`, and infinite at the upper end if it
         is smaller.
     Raises:
         UndefinedMeasure: gamma is 1, or there is a horizon: the optimal policy then depends on the step.
         ParameterError: `solution` is not of this MDP, or an argument is wrong.
-    Cost: two occupancy measures, each of at most ln(1e9) / (1 - gamma) passes over the table; in breadth-first order a
-    tenth of them.
+    Cost: two occupancy measures, each of at most ln(1e9) / (1 - gamma) passes over the table, in breadth-first order a
+        tenth of them.
     Source: Kakade and Langford (2002); Agarwal, Kakade, Lee and Mahajan (2021), "On the theory of policy gradient
         methods", section 4.2.
     """

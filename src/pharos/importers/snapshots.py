@@ -40,7 +40,7 @@ OWNED = frozenset(
 )
 """Attributes that Gymnasium gives to each environment, and that are no state."""
 DROPPED = SILENT | {"OrderEnforcing", "PassiveEnvChecker", "RecordEpisodeStatistics", "TimeLimit"}
-"""Wrappers of LIBRARIES that are left out: they count steps, check, print or record, and change nothing else."""
+"""Wrappers of WRAPPER_LIBRARIES that are left out. They count steps, check, print or record alone."""
 LIMITS = ("_max_episode_steps", "max_episode_steps")
 OUTSIDE = ("pygame", "pyglet", "matplotlib", "weakref", "threading", "logging", "_thread")
 """Libraries whose objects are no state: windows, figures, locks."""

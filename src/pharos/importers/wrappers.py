@@ -37,7 +37,7 @@ UNCHANGING = SILENT | frozenset(
         "TimeLimit",
     ]
 )
-"""Wrappers of LIBRARIES that change nothing of an MDP; its time limit is given as a horizon."""
+"""Wrappers of WRAPPER_LIBRARIES that change nothing of an MDP; its time limit is given as a horizon."""
 WITHOUT_MEMORY = ("minigrid.wrappers:NoDeath",)
 """Wrappers whose rewards and ends are functions of state and action: stepping in every state takes them over."""
 EPISODE = 200

@@ -32,7 +32,7 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
     and "index" if a state space was given. `reset(options={"state": ...})` starts in any state. Sticky and random
     actions draw one number from `np_random` a step, then lazy ones another.
 
-    If the rules have chance, an outcome of the executed action is drawn and its reward paid; `info["prob"]` is the
+    If the rules have chance, an outcome of the executed action is drawn and its reward paid. `info["prob"]` is the
     probability of that outcome, 1.0 after reset, as in Gymnasium's toy text. All numbers, for the start, for sticky and
     random actions, for lazy ones and, after these, for the outcome, then come from the stream that environment 0 of a
     `VectorEnv` has with the same seed: one seed, the same episodes in both. Without a seed, `np_random` seeds that
@@ -40,8 +40,8 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
 
     Args:
         environment: a name that `pharos.make` knows, or an Environment.
-        render_mode: None; "ansi", text; "rgb_array", the picture for people, (H, W, 3) uint8; or "human", a window with
-            that picture, drawn anew at each step, 15 a second at most (needs `pip install 'pharos-rl[play]'`).
+        render_mode: None, "ansi" (text), "rgb_array" (the picture for people, (H, W, 3) uint8), or "human", a window
+            with that picture, drawn anew at each step, 15 a second at most (needs `pip install 'pharos-rl[play]'`).
         options: see `Interaction`, and the parameters of the environment, such as `height=12`.
     Raises:
         ParameterError: an option or parameter is wrong. MissingExtra: render_mode is "human" and pygame is not
@@ -114,7 +114,7 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         return np.asarray(self.simulator.action_masks(self._started()[None])[0])
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start an episode; `options={"state": ...}` is the start state (D integers)."""
+        """Start an episode. `options={"state": ...}` is the start state (D integers)."""
         super().reset(seed=seed)
         simulator = self.simulator
         if self._reward_channel is not None:
@@ -269,7 +269,7 @@ def _window(simulator: Simulator, fps: int) -> "Window":
 
 
 def _step_and_draw(simulator: Simulator) -> Callable[..., tuple[float, int]] | None:
-    """The compiled step that draws as well, for simple images with a pixel for each cell; else None."""
+    """The compiled step that draws as well, for simple images with a pixel for each cell, else None."""
     observation = simulator.context.observation
     if not simulator.context.is_plain or not observation.is_flat:
         return None

@@ -22,8 +22,8 @@ class EnvState(environment.EnvState):
 
     Attributes:
         time: steps so far.
-        index: number of the state; S is the end.
-        previous: the action that was executed last; A before the first step.
+        index: number of the state. S is the end.
+        previous: the action that was executed last, A before the first step.
     """
 
     time: jax.Array
@@ -37,15 +37,15 @@ class EnvParams:
 
     Attributes:
         max_steps_in_episode: time limit.
-        successors: (S + 1, A, K) int32; the last row is the end.
+        successors: (S + 1, A, K) int32. The last row is the end.
         cumulative: (S + 1, A, K) float32, cumulated probabilities of the outcomes.
         rewards: (S + 1, A) float32, what executing an action pays on average.
         ends: (S + 1,) bool, whether an episode is over there.
         starts, start_cumulative: (N,) int32, (N,) float32: start states and their cumulated probabilities.
         observations: (S + 1, ...) what is seen of each state.
-        chance: (4,) float32: probabilities that the chosen, the previous, a uniform action is executed; and that the
+        chance: (4,) float32: probabilities that the chosen, the previous, a uniform action is executed, and that the
             chosen one is on the first step.
-        available: (S + 1, A) bool, the actions that exist in each state; all at the end.
+        available: (S + 1, A) bool, the actions that exist in each state, all at the end.
     """
 
     max_steps_in_episode: int
@@ -61,7 +61,7 @@ class EnvParams:
 
 
 class GymnaxEnv(environment.Environment):
-    """A tabular MDP; `default_params` holds its tables.
+    """A tabular MDP. `default_params` holds its tables.
 
     Args:
         mdp: with its chance.
@@ -211,12 +211,12 @@ class JoinedEnds(GymnaxEnv):
 
 
 def _first_above(cumulative: jax.Array, u: jax.Array) -> jax.Array:
-    """The first entry whose cumulated probability exceeds u; entries that cannot be drawn come after all others."""
+    """The first entry whose cumulated probability exceeds u. Entries that cannot be drawn come after all others."""
     return jnp.minimum(jnp.sum(u >= cumulative), len(cumulative) - 1)
 
 
 def _padded_outcomes(mdp: TabularMDP) -> tuple[np.ndarray, np.ndarray]:
-    """(S + 1, A, K) next states, S for the end, and cumulated probabilities; 1 from the last possible outcome on."""
+    """(S + 1, A, K) next states, S for the end, and cumulated probabilities, 1 from the last possible outcome on."""
     num_states, num_actions = mdp.num_states, mdp.num_actions
     states = np.repeat(np.arange(num_states), num_actions)
     outcomes = mdp.dynamics.outcomes(states, np.tile(np.arange(num_actions), num_states))

@@ -35,10 +35,10 @@ def to_gymnax(
     `env.action_mask(state)` and `info["action_mask"]` say which are.
 
     Args:
-        source: a built space; or an MDP, with its chance.
-        observation, observation_options: what is seen, as `pharos.observe` takes it; or an array (S, ...). Of an MDP
+        source: a built space, or an MDP, with its chance.
+        observation, observation_options: what is seen, as `pharos.observe` takes it, or an array (S, ...). Of an MDP
             that was not made from a space only an array.
-        time_limit: steps of an episode; None: the MDP's horizon, else the limit of the environment.
+        time_limit: steps of an episode. Default: the MDP's horizon, else the limit of the environment.
         joined_ends: whether `step` returns one `done` in place of terminated and truncated, as before gymnax 1.0 and
             as rejax 0.1 expects.
         reward_noise: standard deviation of what is added to each reward.

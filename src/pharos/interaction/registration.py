@@ -1,4 +1,4 @@
-"""Registers the environments with Gymnasium; run by `import pharos`. Entry points are strings: nothing heavy is loaded.
+"""Registers the environments with Gymnasium, run by `import pharos`. Entry points are strings: nothing heavy is loaded.
 
 `gymnasium.make("pharos/Breakout-v0", height=12)` makes an instance of a class, "pharos/Breakout-12x8x1-v0" a named
 instance, and `gymnasium.make("pharos/Environment-v0", environment="breakout/12x10x1")` any environment that

@@ -108,7 +108,7 @@ def make_sb3_vec(
 
     Args:
         env: a name that `pharos.make` knows, or an Environment.
-        seed: of the first reset; environment i is seeded with seed + i.
+        seed: of the first reset. Environment i is seeded with seed + i.
         options: see `pharos.interaction.Interaction`, and the parameters of the environment if `env`
             is a name.
     Raises:

@@ -32,18 +32,18 @@ LARGEST_INDEX = 20_000_000
 @flat
 @dataclass(frozen=True, kw_only=True)
 class Interaction:
-    """The options of interaction, which single and vector environments share; chance by its own names, `sticky=0.1`.
+    """The options of interaction, which single and vector environments share, chance by its own names, `sticky=0.1`.
 
     Attributes:
         observation: a name (`pharos.observations.names()`), a pair (function, Gymnasium space), or an Observation.
         observation_options: of the named observation, such as {"grey": True}.
-        chance: of acting, and in how rewards are paid; see `pharos.training.ChanceSetting` and `RewardChannel`.
+        chance: of acting, and in how rewards are paid, see `pharos.training.ChanceSetting` and `RewardChannel`.
         initial_previous_action: what sticks on the first step. None: nothing, the chosen action is executed (as in
-            Gymnasium's StickyAction); the Arcade Learning Environment starts with its action "noop".
+            Gymnasium's StickyAction). The Arcade Learning Environment starts with its action "noop".
         previous_action: whether the agent sees the previously executed action.
         remaining_time: whether the agent sees the share of the time limit that is left.
-        time_limit: steps after which an episode is truncated; "default" for the limit of the class, None for no limit.
-        space: the built state space of the environment, or its folder; adds "index" to info. The observation "index"
+        time_limit: steps after which an episode is truncated: "default" for the limit of the class, None for no limit.
+        space: the built state space of the environment, or its folder. It adds "index" to info. The observation "index"
             needs it: if none is given, it is taken from the user's cache, or built.
     """
 
@@ -61,9 +61,9 @@ class Simulator:
     """An environment prepared for interaction: rules as compiled functions, observation, chance, time limit.
 
     Attributes:
-        env, state_space, context, limit: as the options say; `context` maps states to what the agent gets.
-        chance: (chosen, previous, uniform), weights of the executed action; they sum to 1.
-        first_chosen: the weight of the chosen action if there is no previous one; the rest is uniform.
+        env, state_space, context, limit: as the options say. `context` maps states to what the agent gets.
+        chance: (chosen, previous, uniform), weights of the executed action. They sum to 1.
+        first_chosen: the weight of the chosen action if there is no previous one. The rest is uniform.
         lazy: the probability that the executed action has no effect.
         modifies_rewards: whether rewards are paid late or with noise.
         has_chance: whether another than the chosen action may be executed.
@@ -113,14 +113,14 @@ class Simulator:
         return np.ones((len(states), self.env.num_actions), np.bool_) if sets is None else sets
 
     def setting(self, mode: int, ranges: np.ndarray, scale: np.ndarray, starts: np.ndarray) -> Setting:
-        """Arguments of the kernels of many environments; `starts` are states, or their indices in a state space."""
+        """Arguments of the kernels of many environments. `starts` are states, or their indices in a state space."""
         limit = self.limit if self.limit is not None else 1 << 62
         return Setting(
             ranges, scale, self._weights_of_kernels, limit, mode, self.first_previous, starts, self.start_cumulative
         )
 
     def drawn_start(self, rng: "np.random.Generator | Stream") -> int:
-        """Index of a drawn start state; draws a random number only if there are several."""
+        """Index of a drawn start state. Draws a random number only if there are several."""
         if len(self.start_states) == 1:
             return 0
         return int(np.searchsorted(self.start_cumulative, rng.random(), side="right"))
@@ -128,7 +128,7 @@ class Simulator:
     def executed(self, action: int, previous: int, u: float, mask: np.ndarray | None = None) -> int:
         """The executed action, by one uniform number u in [0, 1): `action`, then `previous`, then a uniform one.
 
-        mask (A,) bool: the available actions; None: all are.
+        mask (A,) bool: the available actions. None: all are.
         """
         if mask is None:
             return stepping.executed_by_number.py_func(action, previous, self._weights, self.env.num_actions, u)
@@ -143,7 +143,7 @@ class Simulator:
         return executed
 
     def checked_state(self, state: object) -> np.ndarray:
-        """(D,) int64 from a user's state; ParameterError unless every component is in its range."""
+        """(D,) int64 from a user's state. ParameterError unless every component is in its range."""
         values = np.asarray(state)
         if values.shape != (len(self.env.components),) or values.dtype.kind not in "iub":
             raise ParameterError(
@@ -185,14 +185,14 @@ class Stream:
 
 
 def stream_of(seed: int | None, *purpose: int) -> np.ndarray:
-    """(1,) uint64, the stream of random numbers of an environment that is seeded with `seed`; another one for each
+    """(1,) uint64, the stream of random numbers of an environment that is seeded with `seed`, another one for each
     purpose: none for steps, 1 for the noise of rewards, 2 for coins of observations.
     """
     return np.random.SeedSequence(seed, spawn_key=purpose).generate_state(1, np.uint64)
 
 
 def seed_streams(streams: np.ndarray, seeds: Sequence[int | None], *purpose: int) -> None:
-    """Seed the streams (N,) of environments for a purpose; None leaves one as it is."""
+    """Seed the streams (N,) of environments for a purpose. None leaves one as it is."""
     for i, seed in enumerate(seeds):
         if seed is not None:
             streams[i] = stream_of(seed, *purpose)[0]
@@ -216,7 +216,7 @@ class SimulatedEnv:
 
     @property
     def spec(self) -> EnvSpec | None:
-        """Gymnasium's specification, with the limit of this instance; None unless it was made by an id.
+        """Gymnasium's specification, with the limit of this instance. None unless it was made by an id.
 
         The registry says that there is no limit, because it depends on the arguments of `gymnasium.make`: with a number
         there, Gymnasium would wrap the environment in a second TimeLimit that knows nothing of `height=20` or
@@ -305,11 +305,11 @@ class FrameStack:
             self._frames = np.zeros((num_envs, self.observation.frames, *one.shape[1:]), one.dtype)
 
     def seed(self, seeds: Sequence[int | None]) -> None:
-        """Seed the random stream of irrelevant entries of each environment; None leaves a stream as it is."""
+        """Seed the random stream of irrelevant entries of each environment. None leaves a stream as it is."""
         seed_streams(self._rng, seeds, 2)
 
     def push(self, states: np.ndarray, moves: np.ndarray, begins: np.ndarray) -> None:
-        """Add frames of states (N, D); (N,) bool: `moves` after a step, `begins` at the start of an episode."""
+        """Add frames of states (N, D). (N,) bool: `moves` after a step, `begins` at the start of an episode."""
         if self.observation.frames > 1:
             frames = self.observation.frame(states)
             self._frames[moves, :-1] = self._frames[moves, 1:]
@@ -317,11 +317,11 @@ class FrameStack:
             self._frames[begins] = frames[begins, None]
 
     def current(self, states: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
-        """Observations of the N current states; called after `push`."""
+        """Observations of the N current states. Called after `push`."""
         return self._in_context(self._frames, slice(None), states, previous, elapsed)
 
     def terminal(self, rows: np.ndarray, states: np.ndarray, previous: np.ndarray, elapsed: np.ndarray) -> Seen:
-        """Terminal observations of environments `rows`, in states (len(rows), D); `push` never sees these states."""
+        """Terminal observations of environments `rows`, in states (len(rows), D). `push` never sees these states."""
         frames = self._frames[rows]
         if self.observation.frames > 1:
             frames = np.concatenate([frames[:, 1:], self.observation.frame(states)[:, None]], axis=1)
@@ -366,7 +366,7 @@ class RewardChannel:
         self._rng = np.random.SeedSequence().generate_state(num_envs, np.uint64)
 
     def seed(self, seeds: Sequence[int | None]) -> None:
-        """Seed the noise of each environment; None leaves a stream as it is."""
+        """Seed the noise of each environment. None leaves a stream as it is."""
         seed_streams(self._rng, seeds, 1)
 
     def restart(self, mask: np.ndarray) -> None:

@@ -2,7 +2,7 @@
 
 `make_vec("breakout", 1024, observation="vector", sticky=0.25)`, or
 `gymnasium.make_vec("pharos/Breakout-v0", num_envs=1024)`. Chance is drawn inside the loop, from one stream of random
-numbers for each environment: the start, if there are several; then for each step the executed action under sticky or
+numbers for each environment: the start, if there are several. Then for each step the executed action under sticky or
 random actions, whether it has an effect under lazy ones, and the outcome, if the rules have chance. If there is but one
 possibility, nothing is drawn.
 """
@@ -80,7 +80,7 @@ class Stepper(ABC):
         """States (n, D) of positions (n, ...)."""
 
     def vectors(self) -> np.ndarray:
-        """Buffer for vector observations of the next step; empty if the compiled step does not write them."""
+        """Buffer for vector observations of the next step, empty if the compiled step does not write them."""
         return _NO_VECTORS
 
     @abstractmethod
@@ -237,11 +237,11 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         environment: a name that `pharos.make` knows, or an Environment.
         num_envs: N.
         autoreset_mode: of Gymnasium. NEXT_STEP: the step after the end of an episode resets and ignores its action.
-            SAME_STEP: the last step resets too; the last observation is in info["final_obs"]. DISABLED: the caller
+            SAME_STEP: the last step resets too, and the last observation is in info["final_obs"]. DISABLED: the caller
             resets with `options={"reset_mask": mask}`.
         seed: of the first reset, if that is given none.
         max_episode_steps: another name of `time_limit`, as `gymnasium.make_vec` calls it.
-        render_mode: None; or "rgb_array": `render()` returns a picture of each environment.
+        render_mode: None, or "rgb_array": `render()` returns a picture of each environment.
         options: see `Interaction`, and the parameters of the environment, such as `height=12`.
     Raises:
         ParameterError: an option or parameter is wrong.
@@ -299,7 +299,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         return self.simulator.action_masks(self.states)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """The picture for people of each environment, (H, W, 3) uint8, if render_mode is "rgb_array"; else None."""
+        """The picture for people of each environment, (H, W, 3) uint8, if render_mode is "rgb_array", else None."""
         if self.render_mode is None:
             return None
         if self._rng is None:
@@ -315,7 +315,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
 
         Args:
             seed: environment i is seeded with seed + i, or with seed[i].
-            options: {"reset_mask": (N,) bool} resets these environments alone; {"state": (D,) or (N, D)} is where
+            options: {"reset_mask": (N,) bool} resets these environments alone. {"state": (D,) or (N, D)} is where
                 they start.
         """
         options = options or {}
@@ -364,7 +364,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
         return self._observations(np.ones_like(done), begins), rewards, terminated, truncated, info
 
     def _observations(self, moves: np.ndarray, begins: np.ndarray) -> Seen:
-        """Observations of the current states; `moves`, `begins` (N,) bool: after a step, at the start of an episode."""
+        """Observations of the current states. `moves`, `begins` (N,) bool: after a step, at the start of an episode."""
         if self._frame_stack is None:
             return self._stepper.observations(self._previous, self._elapsed)
         states = self._stepper.states(self._stepper.current)
@@ -416,7 +416,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
             info["prob"] = np.where(done, 1.0, info["prob"])
 
     def _seeded(self, seed: int | Sequence[int | None] | None) -> np.ndarray:
-        """Streams of random numbers (N,) uint64; those with a seed are seeded anew."""
+        """Streams of random numbers (N,) uint64. Environments with a seed are seeded anew."""
         n = self.num_envs
         if seed is None and self._rng is not None:
             return self._rng
@@ -463,7 +463,7 @@ class VectorEnv(SimulatedEnv, gymnasium.vector.VectorEnv):
 
 
 def make_vec(name_or_env: Environment | str, num_envs: int = 1, **options: Any) -> VectorEnv:
-    """Return `num_envs` copies of an environment as a Gymnasium vector environment; see `VectorEnv` for the options."""
+    """Return `num_envs` copies of an environment as a Gymnasium vector environment, see `VectorEnv` for the options."""
     return VectorEnv(name_or_env, num_envs, **options)
 
 

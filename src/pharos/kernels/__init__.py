@@ -1,6 +1,6 @@
 """Compiled loops: flat arrays in, flat arrays out, nothing else.
 
-The package announces its files; each is loaded when it is first used, and loads Numba.
+The package announces its files. Each is loaded when it is first used, and loads Numba.
 """
 
 from pharos.system import compiling

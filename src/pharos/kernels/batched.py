@@ -1,19 +1,19 @@
 """W runs at once: their random numbers, episodes on the tables of their MDPs, and minibatches of DQN and PPO.
 
 Random numbers are counted: Philox4x32-10 (Salmon, Moraes, Dror and Shaw, SC 2011), four words of 32 bits a call. The
-same counter and key give the same words, in whatever order they are drawn. A key names a run; a counter names a draw:
+same counter and key give the same words, in whatever order they are drawn. A key names a run, a counter names a draw:
 (draw, copy, step, stream).
 
 Each run has E copies of its environment. Every draw is named by its counter: the run is the key, and a step of a copy
-has one block of four words: a random action; the executed action; the outcome; the start of the next episode. If
-actions may have no effect or rewards are noisy there is another block: whether there is an effect; two for the noise.
-Whether a run explores in a step is a block of its own, as one draw holds for all copies of a run.
+has one block of four words: a random action, the executed action, the outcome, the start of the next episode. If
+actions may have no effect or rewards are noisy there is another block: whether there is an effect, and two words for
+the noise. Whether a run explores in a step is a block of its own, as one draw holds for all copies of a run.
 
 DQN: minibatches of a replay memory, losses with their gradients, Adam with clipping. Sources: Mnih et al. (2015); van
 Hasselt et al. (2016), double; Kingma and Ba (2015).
 
 PPO: advantages, minibatches, the clipped loss with its gradients. Sources: Schulman et al. (2016), generalised
-advantages; Schulman et al. (2017). Each function does for every run what Stable-Baselines3 does for one; docs/agents.md
+advantages; Schulman et al. (2017). Each function does for every run what Stable-Baselines3 does for one. docs/agents.md
 lists the differences in arithmetic.
 """
 
@@ -73,7 +73,7 @@ def below(word, n):
 
 @kernel
 def words(keys, stream, step, out):
-    """out[i, j] = the four words of draw j of copy 0 at a step, in a stream, for key i; keys (N,), out (N, M, 4)."""
+    """out[i, j] = the four words of draw j of copy 0 at a step, in a stream, for key i. keys (N,), out (N, M, 4)."""
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             w = philox(j, 0, step, stream, keys[i])
@@ -133,7 +133,7 @@ def choose(keys, step, explores, q, actions):
 
 @kernel
 def choose_of_sets(keys, step, explores, q, sets, actions):
-    """`choose` among actions that are available, sets (W, E, A) bool; others have a q below all of them."""
+    """`choose` among actions that are available, sets (W, E, A) bool. Others have a q below all of them."""
     for i in range(actions.shape[0]):
         for e in range(actions.shape[1]):
             best, left = -1, -1
@@ -174,7 +174,7 @@ def start(keys, runs, starts, cumulative, state):
 def execute_runs_in_sets(keys, step, chances, sets, previous, actions, executed):
     """executed (W, E): what is executed of chosen actions, in states with the sets (W, E, A) bool.
 
-    Draws what `advance` would draw. chances (W, 4): as in `stepping.Setting`; previous (W, E): -1 if there is none.
+    Draws what `advance` would draw. chances (W, 4): as in `stepping.Setting`. previous (W, E): -1 if there is none.
     """
     for i in range(actions.shape[0]):
         chance = (chances[i, 0], chances[i, 1], chances[i, 2], chances[i, 3])
@@ -190,19 +190,20 @@ def advance(
     transitions, rewards, staying, terminal, starts, cumulative, runs, setting, knobs, actions, episodes, pending,
     transition, counts,
 ):  # fmt: skip
-    """One step of every copy of `runs`, which share an MDP; episodes that have ended start anew.
+    """One step of every copy of `runs`, which share an MDP. Episodes that have ended start anew.
 
-    transitions: see kernels/outcomes.py; rewards: see `outcome_reward`; staying (S, A): the reward of an action without
-    effect, (0, 0) if all have one; terminal (S,); starts, cumulative: start states and their cumulated
+    transitions: see kernels/outcomes.py. rewards: see `outcome_reward`. staying (S, A): the reward of an action without
+        effect, (0, 0) if all have one. terminal: (S,). starts, cumulative: start states and their cumulated
     probabilities.
     setting: (keys (W,) uint64, step, chances (W, 4), limits (W,), gammas (W,)), as in `stepping.Setting`.
     knobs (W, 4): the probability that an action has no effect, the deviation of the noise of rewards, their delay in
     steps, and what they are divided by.
-    pending (W, E, D): rewards earned and not paid yet; see `delayed_reward`.
+    pending (W, E, D): rewards earned and not paid yet, see `delayed_reward`.
     episodes: (state, previous, elapsed (W, E) int64, return, discount (W, E) float64) of the running episodes, and
     (number, sum of returns (W,)) of the finished ones, which this step adds to if `counts` is true.
-    transition: (next state (W, E) int64, reward (W, E) float64, flags (W, E) uint8) of this step, written here; the
-    reward is the paid one, returns are of earned rewards. A transition that ends an episode without a next state has
+    transition: (next state (W, E) int64, reward (W, E) float64, flags (W, E) uint8) of this step, written here. The
+        reward is the paid one, returns are of earned rewards. A transition that ends an episode without a next state
+        has
     the state itself there.
     """
     keys, step, chances, limits, gammas = setting
@@ -252,7 +253,7 @@ def advance(
 
 @kernel
 def act(keys, step, scores, actions, log_probabilities):
-    """Draw actions (W, E) from the softmax of scores (W, E, A); log_probabilities: their logarithms, float32."""
+    """Draw actions (W, E) from the softmax of scores (W, E, A). log_probabilities: their logarithms, float32."""
     num_actions = scores.shape[2]
     for i in range(actions.shape[0]):
         for e in range(actions.shape[1]):
@@ -279,7 +280,7 @@ def act(keys, step, scores, actions, log_probabilities):
 def sample(keys, step, draw, next_row, filled, gammas, num_steps, memory, batch):
     """Draw a minibatch of each run from its replay memory, uniformly, with returns of `num_steps` steps.
 
-    next_row: the row that is written next; filled: the number of rows that are; gammas (W,).
+    next_row: the row that is written next. filled: the number of rows that are. gammas: (W,).
     memory: (state, next state (W, R, E), action (W, R, E), reward (W, R, E) float32, flags (W, R, E)).
     batch: (state, next state (W, B), action (W, B), reward (W, B) float32, discount (W, B) float32), written here:
     discount is the factor of the value of the next state: gamma^n, 0 if the episode ended there. A return stops at
@@ -301,7 +302,7 @@ def sample(keys, step, draw, next_row, filled, gammas, num_steps, memory, batch)
 def sample_histories(keys, step, draw, next_row, filled, gammas, num_steps, memory, batch):
     """`sample` from the `filled` newest rows, with states and next states (W, B, k): the last k of the episode.
 
-    They are read from the rows before; the first state of an episode stands for those before it. Rows that were never
+    They are read from the rows before. The first state of an episode stands for those before it. Rows that were never
     written have the flag ENDED.
     """
     state, next_state, action, reward, flags = memory
@@ -352,7 +353,7 @@ def _last_states(i, row, e, state, flags, out):
 def huber(q, q_next, q_choice, actions, rewards, discounts, dq, loss):
     """The smooth L1 loss of DQN, (W,), and its gradient dq (W, B, A).
 
-    q: (W, B, A) of the states; q_next: of the next states, by the target network; q_choice: what the next action is
+    q: (W, B, A) of the states. q_next: of the next states, by the target network. q_choice: what the next action is
     the best of: q_next itself, or by the online network (double).
     """
     num_rows, num_actions = q.shape[1], q.shape[2]
@@ -386,7 +387,7 @@ def _squares(x):
 
 @kernel(error_model="numpy")
 def _adam(parameters, gradient, mean, square, scale, step, eps):
-    """One step of Adam for one run, in place; `scale` clips the gradient, `step` and `eps` include bias corrections."""
+    """One step of Adam for one run, in place. `scale` clips the gradient, `step` and `eps` include bias corrections."""
     first, second, keep = float32(0.1), float32(0.001), float32(0.999)
     for j in range(len(parameters)):
         g = scale * gradient[j]
@@ -400,7 +401,7 @@ def _adam(parameters, gradient, mean, square, scale, step, eps):
 def adam(parameters, gradients, means, squares, counts, is_active, rates, max_norms, eps):
     """One step of Adam (betas 0.9 and 0.999) for the active runs, by gradients clipped to a norm.
 
-    parameters, gradients, means, squares: (W, P) float32; counts (W,): steps so far; rates, max_norms (W,).
+    parameters, gradients, means, squares: (W, P) float32. counts (W,): steps so far. rates, max_norms: (W,).
     """
     for i in range(len(parameters)):
         if is_active[i]:
@@ -414,7 +415,7 @@ def adam(parameters, gradients, means, squares, counts, is_active, rates, max_no
 
 @kernel(fastmath={"contract"})
 def linear_row(parameters, weight, bias, x, is_relu, y):
-    """y (W, out) = x (W, in) w + b, at least 0 if `is_relu`; the weights of inputs that are 0 are not read.
+    """y (W, out) = x (W, in) w + b, at least 0 if `is_relu`. The weights of inputs that are 0 are not read.
 
     parameters (W, P) float32: w begins at `weight`, in rows of `out`, and b at `bias`.
     """
@@ -438,8 +439,8 @@ def linear_row(parameters, weight, bias, x, is_relu, y):
 def advantages(rewards, values, begins, last_values, ends, gammas, lambdas, out):
     """out (W, T, E) = generalised advantages of rollouts of T steps.
 
-    rewards, values, begins (W, T, E) float32: begins is 1 if a step is the first of an episode; last_values (W, E)
-    of the states after the rollout, ends (W, E) whether the last step ended an episode; gammas, lambdas (W,).
+    rewards, values, begins (W, T, E) float32: begins is 1 if a step is the first of an episode. last_values (W, E): of
+    the states after the rollout. ends (W, E): whether the last step ended an episode. gammas, lambdas: (W,).
     """
     num_steps, copies = rewards.shape[1], rewards.shape[2]
     for i in range(rewards.shape[0]):
@@ -485,7 +486,7 @@ def gather(order, first, sources, targets):
 
 @kernel
 def normalize_advantages(advantages):
-    """Normalise advantages (W, B) in place: less the mean of each run, by its standard deviation + 1e-8; B >= 2."""
+    """Normalise advantages (W, B) in place: less the mean of each run, by its standard deviation + 1e-8, for B >= 2."""
     number = advantages.shape[1]
     for i in range(advantages.shape[0]):
         mean, squares = 0.0, 0.0
@@ -503,7 +504,7 @@ def normalize_advantages(advantages):
 def clipped_loss(scores, values, minibatch, clip_ranges, entropy_weights, value_weights, dscores, dvalues, loss, kl):
     """The loss of PPO (W,), its gradients, and the approximate divergence from the old policy (W,).
 
-    scores (W, B, A), values (W, B, 1) float32; dscores and dvalues (gradients) of the same shapes.
+    scores (W, B, A), values (W, B, 1) float32, and dscores and dvalues (gradients) of the same shapes.
     minibatch: (actions, old logarithms of probabilities, advantages, returns), (W, B) each.
     """
     actions, old, advantage, returns = minibatch

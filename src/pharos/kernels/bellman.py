@@ -26,7 +26,7 @@ from pharos.kernels.outcomes import expectation, fetch_values, outcome, outcome_
 
 
 def state_at(order, i):
-    """The state at index i of an order; i itself if the order is None."""
+    """The state at index i of an order, or i itself if the order is None."""
 
 
 @overload(state_at)
@@ -59,7 +59,7 @@ def is_increasing(transitions, live, age):
 def topological_order(transitions, live):
     """States in topological order, without the states of cycles and all that these lead to.
 
-    Cost: two passes over the transitions; 16 bytes a state.
+    Cost: two passes over the transitions, and 16 bytes a state.
     """
     num_states, num_actions = size_of(transitions)
     waiting = np.zeros(num_states, np.int64)  # edges from states that are not done yet
@@ -98,7 +98,8 @@ def topological_order(transitions, live):
 @interpreted_first()
 @kernel
 def longest_path(transitions, live, order):
-    """Edges of the longest path, given a topological order. Cost: one pass over the transitions; 4 bytes a state."""
+    """Edges of the longest path, given a topological order. Cost: one pass over the transitions, and 4 bytes a
+    state."""
     num_states, num_actions = size_of(transitions)
     length = np.zeros(num_states, np.int32)
     longest = 0
@@ -145,7 +146,7 @@ def _reward_at(table, palette, s, a):
 
 
 def set_has(weights, s, a):
-    """Whether action a is available in state s, by weights with sets behind; True if they have none."""
+    """Whether action a is available in state s, by weights with sets behind. True if they have none."""
 
 
 @overload(set_has, jit_options={"forceinline": True})
@@ -319,7 +320,7 @@ def _choice_value_of(choice, q, actions, s):
 def sticky_sweep(transitions, table, palette, gamma, weights, choice, v, actions, q, order, start, stop):
     """v[s, b] = chosen q(s, choice) + previous q(s, b) + uniform mean_a q(s, a), in place.
 
-    v (S + 1, A); q (A,) scratch; for indices [start, stop) of the order.
+    v (S + 1, A), and q (A,) as scratch, for indices [start, stop) of the order.
     """
     chosen_weight, previous_weight, uniform_weight = weights[0], weights[1], weights[2]
     change = 0.0
@@ -341,7 +342,7 @@ def sticky_sweep(transitions, table, palette, gamma, weights, choice, v, actions
 @interpreted_first()
 @kernel(makes_arrays=False)
 def sticky_backup(transitions, table, palette, gamma, weights, choice, v, out, actions, q, runs):
-    """out[s, b] = the backup of v for s of some runs (R, 2), not in place; terms as in `sticky_sweep`."""
+    """out[s, b] = the backup of v for s of some runs (R, 2), not in place, with terms as in `sticky_sweep`."""
     chosen_weight, previous_weight, uniform_weight = weights[0], weights[1], weights[2]
     for i in range(len(runs)):
         stop = runs[i, 1]
@@ -370,7 +371,7 @@ def _policy_value(transitions, table, palette, gamma, weights, policy, v, action
 @interpreted_first()
 @kernel(makes_arrays=False)
 def policy_sweep(transitions, table, palette, gamma, weights, policy, v, actions, order, start, stop):
-    """v[s] = sum_a (chosen policy[s, a] + uniform / A) q(s, a), in place; policy (S, A): probabilities of choosing."""
+    """v[s] = sum_a (chosen policy[s, a] + uniform / A) q(s, a), in place. policy (S, A): probabilities of choosing."""
     change = 0.0
     for i in range(stop - 1, start - 1, -1):
         s = state_at(order, i)
@@ -383,7 +384,7 @@ def policy_sweep(transitions, table, palette, gamma, weights, policy, v, actions
 @interpreted_first()
 @kernel(makes_arrays=False)
 def policy_backup(transitions, table, palette, gamma, weights, policy, v, out, actions, runs):
-    """out[s] = the backup of v for s of some runs (R, 2), not in place; terms as in `policy_sweep`."""
+    """out[s] = the backup of v for s of some runs (R, 2), not in place, with terms as in `policy_sweep`."""
     for i in range(len(runs)):
         for s in range(runs[i, 0], runs[i, 1]):
             out[s] = _policy_value(transitions, table, palette, gamma, weights, policy, v, actions, s)
@@ -391,7 +392,7 @@ def policy_backup(transitions, table, palette, gamma, weights, policy, v, out, a
 
 @inlined
 def _sticky_policy_values(transitions, table, palette, gamma, weights, policy, v, actions, q, values, s):
-    """values[b] = sum_a (chosen policy[s, b, a] + uniform / A) q(s, a) + previous q(s, b); q (A,) scratch."""
+    """values[b] = sum_a (chosen policy[s, b, a] + uniform / A) q(s, a) + previous q(s, b), with q (A,) as scratch."""
     chosen_weight, previous_weight, uniform_weight = weights[0], weights[1], weights[2]
     uniform_share = uniform_weight / set_size(weights, s, actions)
     looks_back = policy.shape[1] > 1
@@ -432,7 +433,7 @@ def sticky_policy_sweep(transitions, table, palette, gamma, weights, policy, v, 
 @interpreted_first()
 @kernel(makes_arrays=False)
 def sticky_policy_backup(transitions, table, palette, gamma, weights, policy, v, out, actions, q, runs):
-    """out[s, b] = the backup of v for s of some runs (R, 2), not in place; terms as in `sticky_policy_sweep`."""
+    """out[s, b] = the backup of v for s of some runs (R, 2), not in place, with terms as in `sticky_policy_sweep`."""
     for i in range(len(runs)):
         for s in range(runs[i, 0], runs[i, 1]):
             _sticky_policy_values(transitions, table, palette, gamma, weights, policy, v, actions, q, out[s], s)
@@ -441,7 +442,7 @@ def sticky_policy_backup(transitions, table, palette, gamma, weights, policy, v,
 @interpreted_first()
 @kernel
 def solve_chain(successor, reward, gamma, v, order):
-    """Exact values on the graph of a deterministic policy: successor (S,), -1 ends; reward (S,); v gets the values.
+    """Exact values on the graph of a deterministic policy: successor (S,), -1 ends, reward (S,). v gets the values.
 
     Every walk runs into the end, into a state already done, or into a new cycle, whose value is the geometric series of
     its rewards. order (S,) is scratch. Returns a state on a cycle whose value is infinite (gamma = 1), or -1.
@@ -493,7 +494,7 @@ def solve_chain(successor, reward, gamma, v, order):
 
 @kernel(makes_arrays=False)
 def component_order(transitions, live, component, first, is_cyclic, order):
-    """order (S,) = the states by component, ascending in each; the states of component c from first[c] to first[c + 1].
+    """order (S,) = the states by component, ascending in each, the states of component c from first[c] to first[c + 1].
 
     is_cyclic[c] = whether a state of c can be visited again. first (C + 1,): zero before.
     """
@@ -527,8 +528,8 @@ def component_order(transitions, live, component, first, is_cyclic, order):
 def joined_components(first, is_cyclic, least):
     """(starts (G + 1,) in the order, whether each group has a cycle): neighbouring components joined into groups.
 
-    Components without a cycle are joined as long as they follow each other; one with a cycle is joined by those that
-    come next until the group has `least` states.
+    Components without a cycle are joined as long as they follow each other. A component with a cycle is joined by the
+    next ones until the group has `least` states.
     """
     starts = np.empty(len(first), np.int64)
     has_cycle = np.empty(len(is_cyclic), np.bool_)
@@ -564,7 +565,7 @@ def sweep_groups(
 ):
     """Sweep group by group, from the last to the first, each until it changes by at most `target`, or by its rounding.
 
-    starts, has_cycle: as from `joined_components`; rounding: a change that is no more than rounding, relative to the
+    starts, has_cycle: as from `joined_components`. rounding: a change that is no more than rounding, relative to the
     values. max_backups: after so many each group that is left is swept once. largest_before: the largest absolute value
     so far. The other arguments are the arguments of all backups.
     """
@@ -587,8 +588,9 @@ def sweep_groups(
 def lengthen_paths(next_states, rewards, ends, v, is_reached, action):
     """Make the longest paths so far longer by single steps, in place, from the last state to the first.
 
-    v (S + 1,): what the path from each state to the end pays, if is_reached; row S is the end. rewards (S, A) and v
-    are whole numbers. action (S,): the first step of the path; -1: it stops there. Rows of ends (S,) bool do not count.
+    v (S + 1,): what the path from each state to the end pays, if is_reached. Row S is the end. rewards (S, A) and v
+    are whole numbers. action (S,): the first step of the path, -1 if it stops there. Rows of ends (S,) bool do not
+    count.
     Returns how many it changed. Source: Bellman (1958), Ford (1956).
     """
     changed = 0

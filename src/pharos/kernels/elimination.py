@@ -6,11 +6,11 @@ quotients of numbers that are not negative, so that each keeps its relative accu
 component is carried beside its rows: no difference from 1 is taken.
 
 Nodes come by strongly connected component, those that lead to no other one first: no component fills in another one.
-Row n has the entries node[k], weight[k] for k from first[n] to first[n + 1]; its component has the nodes begin[n] to
+Row n has the entries node[k], weight[k] for k from first[n] to first[n + 1]. Its component has the nodes begin[n] to
 stop[n]. In components the pattern of a factor is symmetric: row n of `upper` has the columns up_node of up_first[n] to
-up_first[n + 1], which are above n; `lower` has low_node, below n.
+up_first[n + 1], which are above n. `lower` has low_node, below n.
 
-Numbers are float64; or pairs of them, held as complex numbers, whose sum real + imag has 106 bits.
+Numbers are float64, or pairs of them, held as complex numbers, whose sum real + imag has 106 bits.
 Source: Grassmann, Taksar and Heyman (1985); O'Cinneide (1993), "Entrywise perturbation theory and error analysis for
 Markov chains"; Alfa, Xue and Ye (2002), "Accurate computation of the smallest eigenvalue of a diagonally dominant
 M-matrix"; pairs: Dekker (1971), "A floating-point technique for extending the available precision".
@@ -62,7 +62,7 @@ def factorize(
 @interpreted_first()
 @kernel(makes_arrays=False)
 def substitute(first, node, weight, begin, stop, up_first, up_node, low_first, low_node, upper, lower, pivot, right, x):
-    """x (N + 1,) of the right sides (N,) float64, by what `factorize` filled in; x[N] = 0 before and after."""
+    """x (N + 1,) of the right sides (N,) float64, by what `factorize` filled in. x[N] = 0 before and after."""
     start = 0
     while start < len(pivot):
         end = stop[start]
@@ -87,7 +87,7 @@ def substitute(first, node, weight, begin, stop, up_first, up_node, low_first, l
 @kernel(makes_arrays=False)
 def improve(first, node, weight, rows, rewards, backward, v, policy):
     """Sweep v (N + 1,) in place to the best of the rows of each node, from rows[n] to rows[n + 1], and keep that row in
-    policy (N,) if it is better beyond rounding; returns how many were."""
+    policy (N,) if it is better beyond rounding. Returns how many were."""
     count, size = 0, len(policy)
     for i in range(size):
         n = size - 1 - i if backward else i
@@ -107,11 +107,11 @@ def improve(first, node, weight, rows, rewards, backward, v, policy):
 
 
 def plus(x, y):
-    """x + y, as accurate as x is held; y may be a float if x is a pair."""
+    """x + y, as accurate as x is held. y may be a float if x is a pair."""
 
 
 def times(x, y):
-    """x y, as accurate as x is held; y may be a float if x is a pair."""
+    """x y, as accurate as x is held. y may be a float if x is a pair."""
 
 
 def over(x, y):

@@ -4,7 +4,7 @@ Common arguments: transitions: see kernels/outcomes.py. Node n = s W + b is the 
 A under sticky actions, else 1. A choice a of a node executes a, its b or any action, as the weights (chosen, previous,
 uniform) have it, and an executed action e leads from s to nodes t W + e, or t if W is 1. With first_chosen and the
 sets of available actions behind the weights, a b that is not available counts as none, and a uniform action is one that
-is. allowed (N, A) bool: the choices that count; count (N,) integers: how many a node has.
+is. allowed (N, A) bool: the choices that count. count (N,) integers: how many a node has.
 
 Strongly connected components are found along allowed choices. A choice that may lead out of the component of its node,
 or to the end, is no choice of an end component: it is removed, and the rest is looked at again, until nothing changes.
@@ -56,12 +56,12 @@ def may_execute(weights, allowed, count, n, s, b, e):
 @interpreted_first()
 @kernel
 def number_components(transitions, weights, allowed, count, component, path, waiting):
-    """component[n] = the number of the strongly connected component of n, in topological order; returns how many.
+    """component[n] = the number of the strongly connected component of n, in topological order. Returns how many.
 
     A component has a smaller number than those that it leads to. Of states whose choices all count, weights and count
-    are None, and allowed (S,) bool: which of them lead on. component, path, waiting (N,) integers; the last two are
+    are None, and allowed (S,) bool: which of them lead on. component, path, waiting (N,) integers. The last two are
     scratch.
-    Cost: one look at each transition, in the order of a depth-first search; 9 bytes a node on top.
+    Cost: one look at each transition, in the order of a depth-first search, and 9 bytes a node on top.
     """
     num_states, num_actions = size_of(transitions)
     num_nodes = len(component)
@@ -129,7 +129,7 @@ def number_components(transitions, weights, allowed, count, component, path, wai
 @interpreted_first()
 @kernel
 def remove_leaving(transitions, weights, component, allowed, count, leaves):
-    """Remove choices that may end, or lead to another component or to a node without choices; returns how many.
+    """Remove choices that may end, or lead to another component or to a node without choices. Returns how many.
 
     leaves (A,) bool is scratch. One pass, from the last node to the first.
     """

@@ -1,10 +1,10 @@
-"""Suboptimality gaps of blocks of states, their sums, and proofs of ties; hardness/gaps.py says what they mean.
+"""Suboptimality gaps of blocks of states, their sums, and proofs of ties. hardness/gaps.py says what they mean.
 
-gap (N, A) float64 >= 0, 0 for the best actions; counted (N,) int64, how often a row counts.
+gap (N, A) float64 >= 0, 0 for the best actions. counted (N,) int64: how often a row counts.
 
 A tie is proven if equal values have equal rewards and next values. The map from a value to these: entries (C, 3)
 int64, or (C, 5) if there are several previous actions, with open addressing: the bits of a value (FREE if there
-is none), of the reward and the value that follow, and the same two of the previous action; C is a power of two.
+is none), of the reward and the value that follow, and the same two of the previous action. C is a power of two.
 """
 
 import math
@@ -47,7 +47,7 @@ def bin_of(gap: float) -> int:
 @interpreted_first()
 @kernel
 def differences(rewards, next_values, gamma):
-    """(N, A) gaps: the largest r + gamma x of a row, less each; rewards r, next_values x (N, A)."""
+    """(N, A) gaps: the largest r + gamma x of a row, less each, for rewards r and next_values x (N, A)."""
     num_states, num_actions = rewards.shape
     gap = np.empty((num_states, num_actions))
     for i in range(num_states):
@@ -63,7 +63,7 @@ def differences(rewards, next_values, gamma):
 @interpreted_first("gap")
 @kernel(error_model="numpy")
 def add_up(gap, weight, counted, minimal, tolerance, error, regularizer, sums, counts, histogram):
-    """Add the gaps of a block to sums, counts and histogram; returns the smallest gap above the tolerance so far.
+    """Add the gaps of a block to sums, counts and histogram. Returns the smallest gap above the tolerance so far.
 
     Regularized gaps count weight (N,) times, all others as often as their row counts. `minimal`: the smallest gap of
     earlier blocks.
@@ -118,14 +118,14 @@ FREE_KEY = -1  # the bits of a NaN, which no value is
 @interpreted_first("gap")
 @kernel
 def extend(values, rewards, next_values, gap, counted, begin, entries, filled):
-    """Map values[i, b] to (rewards, next_values) of the best actions; if there are several b, also to those under b.
+    """Map values[i, b] to (rewards, next_values) of the best actions. If there are several b, also to those under b.
 
     values (N, W), rewards, next_values (N, A): int64, the bits of floats. The best actions of a row have the same
-    value, so they must have the same rewards and next values; then one of them stands for all.
+    value, so they must have the same rewards and next values. Then one of them stands for all.
 
     Returns:
         (i, filled): the row at which it stopped, because all are done (i = N) or half of the entries are taken, and how
-        many those are; i = -1 if a value has two different rows.
+        many those are. i = -1 if a value has two different rows.
     """
     num_actions, width = gap.shape[1], values.shape[1]
     for i in range(begin, len(gap)):
@@ -166,7 +166,7 @@ def refill(old_entries, entries):
 
 @kernel
 def _put(key, reward, next_value, other_reward, other_next_value, entries):
-    """Enter a key with its row; returns 1 if the key is new, 0 if it has this row, -1 if it has another."""
+    """Enter a key with its row. Returns 1 if the key is new, 0 if it has this row, -1 if it has another."""
     index = _entry_of(key, entries)
     is_new = entries[index, 0] == FREE_KEY
     if is_new:

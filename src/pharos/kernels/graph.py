@@ -2,14 +2,14 @@
 
 Nodes are the S states and, if some transition is -1, one more: node S, the implicit end of an episode. `ends` (S,)
 bool marks states whose row is not followed (terminal states). With `start` >= 0 every such state and node S lead to
-`start` in one step, without that edge being stored; with `start` = -1 they lead nowhere.
+`start` in one step, without that edge being stored. With `start` = -1 they lead nowhere.
 
 Searches go forward on the table of next states and backward on a reversed copy. Distances are in steps, -1 if there
-is no path. `queue` is scratch of one entry a node; after a search it holds the nodes found, in the order of their
+is no path. `queue` is scratch of one entry a node. After a search it holds the nodes found, in the order of their
 distance.
 
 Distance sweeps need neither queue nor reversed copy: they pass over the table in order. distance (N,) holds 0 at the
-source and `far`, the largest number of its type, elsewhere, and upper bounds from then on; they are the distances once
+source and `far`, the largest number of its type, elsewhere, and upper bounds from then on. They are the distances once
 a sweep changes nothing, as none can be lowered along an edge then. Breadth-first search numbers a state before those
 that it leads to, so that most paths are followed in one sweep.
 
@@ -29,7 +29,7 @@ from pharos.kernels.outcomes import outcome, outcome_numbers, size_of
 def search(table, reverse, start, source, distance, queue):
     """distance[v] = steps from `source` to v by the table, or from v to `source` by the reversed graph.
 
-    table: (next_states, ends), or None; reverse, if table is None: (first, previous) of `reversed_graph`, and the
+    table: (next_states, ends), or None. reverse, if table is None: (first, previous) of `reversed_graph`, and the
     nodes that lead to `start`. Returns (nodes found, largest distance, sum of distances).
     """
     if reverse is not None:
@@ -86,7 +86,7 @@ def search(table, reverse, start, source, distance, queue):
 def fill_predecessors(next_states, ends, first, previous):
     """previous[first[v] : first[v + 1]] = distinct predecessors of v other than v, by rows that are followed.
 
-    `first` is shifted by one place before: first[v + 1] is the beginning of v; the call moves it to the end of v. If
+    `first` is shifted by one place before: first[v + 1] is the beginning of v. The call moves it to the end of v. If
     `previous` is None, the call counts only: first (zero before) becomes the number of predecessors, one place ahead.
     """
     num_states, num_actions = next_states.shape
@@ -117,7 +117,7 @@ def is_new_edge(next_states, u, a):
 def reversed_graph(next_states, ends, num_nodes):
     """(first, previous) of the reversed graph by a counting sort, without loops and repeated edges.
 
-    Cost: two passes over the table; one entry an edge and one a node, of 4 bytes below 2^31 edges, else 8.
+    Cost: two passes over the table, one entry an edge and one a node, of 4 bytes below 2^31 edges, else 8.
     """
     small = next_states.size < 2**31
     counts = np.zeros(num_nodes + 2, np.int32 if small else np.int64)
@@ -133,8 +133,8 @@ def reversed_graph(next_states, ends, num_nodes):
 def bound_eccentricities(from_pivot, to_pivot, out_pivot, in_pivot, out_lower, out_upper, in_lower, in_upper):
     """Tighten the bounds of all eccentricities from a search in both directions from one pivot p.
 
-    out(v) = max over w of d(v, w) <= d(v, p) + out(p), and >= d(v, p); in(v) = max over w of d(w, v) likewise.
-    from_pivot[v] = d(p, v); to_pivot[v] = d(v, p); out_pivot, in_pivot: the eccentricities of p.
+    out(v) = max over w of d(v, w) <= d(v, p) + out(p), and >= d(v, p). in(v) = max over w of d(w, v) likewise.
+    from_pivot[v] = d(p, v), to_pivot[v] = d(v, p). out_pivot, in_pivot: the eccentricities of p.
     """
     for v in range(len(from_pivot)):
         to, away = to_pivot[v], from_pivot[v]
@@ -150,7 +150,7 @@ def open_eccentricities(out_lower, out_upper, in_lower, in_upper, best):
     """Summary of the nodes whose eccentricity may exceed `best`: how many are open, and the node to search from next.
 
     Returns (open out, open in, node of the largest upper bound out, the same in, open node in the middle): the middle
-    is the least sum of lower bounds; ties of upper bounds go to the larger lower bound.
+    is the least sum of lower bounds. Ties of upper bounds go to the larger lower bound.
     """
     num_out, num_in = 0, 0
     far_out, far_in, middle = -1, -1, -1
@@ -185,9 +185,9 @@ def open_eccentricities(out_lower, out_upper, in_lower, in_upper, best):
 @interpreted_first("n")
 @kernel
 def onwards(transitions, nodes, n, next_nodes, is_visited):
-    """States that nodes[:n] lead to and that were not visited before; returns how many.
+    """States that nodes[:n] lead to and that were not visited before. Returns how many.
 
-    next_nodes (S,): the first entries get them; is_visited (S,) bool.
+    next_nodes (S,): the first entries get them. is_visited: (S,) bool.
     """
     count = 0
     for i in range(n):
@@ -208,7 +208,7 @@ def onwards(transitions, nodes, n, next_nodes, is_visited):
 def lower_backward(next_states, ends, start, distance, far, first, stop):
     """distance[u] = min(distance[u], 1 + the least distance of its successors), for rows [first, stop), last one first.
 
-    Returns how many it lowered; -1 if a distance reaches `far`.
+    Returns how many it lowered, -1 if a distance reaches `far`.
     """
     num_states, num_actions = next_states.shape
     lowered = 0
@@ -233,7 +233,7 @@ def lower_backward(next_states, ends, start, distance, far, first, stop):
 def lower_forward(next_states, ends, start, distance, far, first, stop):
     """distance[v] = min(distance[v], distance[u] + 1) for the successors v of rows u in [first, stop), first one first.
 
-    Returns how many it lowered; -1 if a distance reaches `far`.
+    Returns how many it lowered, -1 if a distance reaches `far`.
     """
     num_states, num_actions = next_states.shape
     lowered = 0
@@ -301,10 +301,10 @@ def last_gap(next_states, ends, start, order, layer_first, position, current, co
 
     Every edge leads from layer j to layer j + 1 modulo P. order (N,): the nodes by layer, layer_first (P + 1,),
     position (N,): index of a node in its layer. current, coming: (widest layer, words) uint64 scratch.
-    Returns (gap, table entries read); the gap is -1 if layers are single nodes, -2 if it is at least P, -3 if
+    Returns (gap, table entries read). The gap is -1 if layers are single nodes, -2 if it is at least P, -3 if
     `max_reads` were not enough.
 
-    f(j) = first k for which every node of layer j reaches layer j + k whole; f(j) <= f(j + 1) + 1. So going down from a
+    f(j) = first k for which every node of layer j reaches layer j + k whole. f(j) <= f(j + 1) + 1. So going down from a
     layer whose f is known, layers that cannot pass the best gap so far are skipped.
     """
     num_states, num_actions = next_states.shape
@@ -370,13 +370,13 @@ def search_in_step(
 ):
     """Search backward from many targets at once, a bit each, so that all searches stand in the same layer at each tick.
 
-    Every edge leads from layer j to layer j + 1 modulo P; states that end lead nowhere. So a tick reads one layer,
+    Every edge leads from layer j to layer j + 1 modulo P. States that end lead nowhere. So a tick reads one layer,
     whereas searches that keep step by their levels read as many as they have targets in different layers. From a node v
     there is another way to target i, of home[v] + away[i] steps.
 
     order (N,): the nodes by layer, layer_first (P + 1,), position (N,): index of a node in its layer. Target i joins at
-    tick offset[i], ascending from 0; `layer` is the layer of the first. scratch (2, widest layer, words) uint64; visits
-    (N, words) uint64, zero before: by index in `order`, the targets that a node reaches.
+    tick offset[i], ascending from 0. `layer` is the layer of the first. scratch: (2, widest layer, words) uint64.
+    visits (N, words) uint64, zero before: by index in `order`, the targets that a node reaches.
     Returns table entries read. largest[i], `best` before, becomes the largest over all nodes of the lesser of both
     ways to target i, if that is more.
     """
@@ -445,12 +445,11 @@ def _gcd(a, b):
 @interpreted_first("queue")
 @kernel
 def symmetry(next_states, ends, start, s, t, image, preimage, queue):
-    """Find the map f with f(s) = t and f(next_states[u, a]) = next_states[f(u), a]; there is at most one.
+    """Find the map f with f(s) = t and f(next_states[u, a]) = next_states[f(u), a]. There is at most one.
 
     All states must be within reach of s. A state that ends the episode is mapped to such a one, the end (-1) to
-    itself, and so is `start` if states lead there as they end. image, preimage: (S,), zero before; afterwards, as
-    far as queue[:steps], image[u] = f(u) + 1 and preimage[f(u)] = u + 1.
-    Returns (whether there is such a map, steps).
+    itself, and so is `start` if states lead there as they end. image, preimage: (S,), zero before. Afterwards, as far
+    as queue[:steps], image[u] = f(u) + 1 and preimage[f(u)] = u + 1. Returns (whether there is such a map, steps).
     """
     num_states, num_actions = next_states.shape
     image[s], preimage[t], queue[0] = t + 1, s + 1, s
@@ -491,7 +490,7 @@ def forget(image, preimage, queue, steps):
 
 @kernel
 def join(orbit, image):
-    """Unite the orbits of u and its image, for every u, by union-find; returns how many orbits there are.
+    """Unite the orbits of u and its image, for every u, by union-find. Returns how many orbits there are.
 
     orbit (S,): a smaller state of the same orbit, or itself.
     """

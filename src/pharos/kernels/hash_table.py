@@ -14,9 +14,9 @@ it. table (slots,) leads from the hash of a state to its entry, a row of keys an
 On disk each entry is a whole state and its index: entries (slots, W + 1) uint64, a mapped file, holds the W words of a
 state, then 1 + its index, 0 in a free slot, or NEW + j while candidate j waits for its number. Memory is read and
 written in order of slots: many candidates are first sorted by the 16 highest bits of their hash, their bucket, which
-are the highest bits of their slot in a table of any size. keys (M, W) uint64: candidates; indices (M,) int64:
--1 - bucket, or an index if it is known; order (M,) int32: candidates that are looked up, by bucket, each bucket in
-the order of candidates.
+are the highest bits of their slot in a table of any size. keys (M, W) uint64: candidates. indices (M,) int64: -1 -
+bucket, or an index if it is known. order (M,) int32: candidates that are looked up, by bucket, each bucket in the order
+of candidates.
 
 The last section packs states into words and unpacks them a few at a time, whereas NumPy (rules/layout.py) would take a
 call for each component.
@@ -220,8 +220,8 @@ def slots_of(keys, capacity, out):
 def insert_missing(table, states, keys, indices, successors, progress):
     """Number the successors that threads did not find, in order: the serial half of expanding a wide frontier.
 
-    keys (rows * A, W): the successors; indices (rows * A,): index, or -1 - slot from which to search on. Row i belongs
-    to state progress[FIRST] + i; successors (rows, A) gets the indices. `progress` goes on by these rows.
+    keys (rows * A, W): the successors. indices (rows * A,): index, or -1 - slot from which to search on. Row i belongs
+    to state progress[FIRST] + i. successors (rows, A) gets the indices. `progress` goes on by these rows.
     """
     first, count, level_end, depth = progress[FIRST], progress[COUNT], progress[LEVEL_END], progress[DEPTH]
     capacity = table.shape[0]
@@ -276,8 +276,8 @@ _OWNER_BITS = 24  # the lowest of a hash, which the slots of tables below 2^32 o
 def route(keys, indices, size, order, counts):
     """Sort candidates by their owners.
 
-    keys (M, W); indices (M,): negative if a candidate must be looked up by its owner. order (M,) int64 gets these
-    candidates, the candidates of the first owner first and each owner's in their order; counts (size,) int64 gets the
+    keys: (M, W). indices (M,): negative if a candidate must be looked up by its owner. order (M,) int64 gets these
+    candidates, the candidates of the first owner first and each owner's in their order. counts (size,) int64 gets the
     number of each owner's.
     """
     owners = np.empty(len(keys), np.int64)
@@ -302,7 +302,7 @@ def route(keys, indices, size, order, counts):
 def claim_entries(table, keys, numbers, count, candidates, indices, entries):
     """Find the entry of each candidate that this owner is asked for, and make one for each that is new.
 
-    candidates (N, W), indices (N,): states and their indices in the block; entries (N,) int64 gets their entries. Of
+    candidates (N, W), indices (N,): states and their indices in the block. entries (N,) int64 gets their entries. Of
     the indices that lead to a new state the first is kept, whatever the order in which they come. Returns the number of
     entries.
     """
@@ -371,7 +371,7 @@ def _enter(entries, slot, keys, j, entry):
 
 @kernel
 def sort_by_bucket(indices, first, order):
-    """Fill order (M,) with the candidates to look up, sorted by bucket; returns their number.
+    """Fill order (M,) with the candidates to look up, sorted by bucket. Returns their number.
 
     indices[j] >= 0, a state in this block that leads to itself, gets its index: first + indices[j].
     """
@@ -407,7 +407,7 @@ def sort_by_bucket(indices, first, order):
 def look_up(entries, keys, order, low, high, indices, slots):
     """Look up candidates order[low:high], entering those that are new.
 
-    indices[j] becomes the index of candidate j; -1 if it is new, slots[j] then being its slot; -2 - i if it
+    indices[j] becomes the index of candidate j. It is -1 if it is new, slots[j] then being its slot, and -2 - i if it
     equals the earlier candidate i, which is new.
     """
     capacity = entries.shape[0]
@@ -468,7 +468,7 @@ def assign_numbers(entries, order, low, high, indices, slots):
 
 @kernel
 def place(entries, keys, order, low, high, first):
-    """Put states order[low:high] of keys, not there yet, into the table; state j has index first + j."""
+    """Put states order[low:high] of keys, not there yet, into the table. State j has index first + j."""
     for p in range(low, high):
         j = order[p]
         slot, _ = _slot_for(entries, keys, j)
@@ -516,7 +516,7 @@ def pack_rows(word, shift, low, states, packed):
 @interpreted_first("states")
 @kernel
 def unpack_rows(word, shift, mask, low, packed, states):
-    """states (N, D) int64 = components of packed (N, W); the inverse of `pack_rows`."""
+    """states (N, D) int64 = components of packed (N, W), the inverse of `pack_rows`."""
     for n in range(len(packed)):
         for i in range(len(word)):
             states[n, i] = np.int64((packed[n, word[i]] >> shift[i]) & mask[i]) + low[i]

@@ -7,12 +7,11 @@ again for the others.
 
 Ways back bound the expected times between neighbouring states, for all pairs at once; from them follow bounds from a
 hub to each target, and closer ones through the nodes around the target: hardness/stochastic_diameter.py proves all.
-Outcomes: state x has those numbered first[x] to first[x + 1]: outcome i happens with probability prob[i] when action[i]
-is executed (-1: any action), and leads to node[i]. Outcome i stands for the aim to go from x to node[i] by choosing
-action[i].
+Outcome i stands for the aim to go from its state to node[i] by choosing action[i].
 """
 
 import heapq
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +20,24 @@ from pharos.kernels.kernel_cache import kernel
 
 # Half the distance from 1 to the next float: the relative rounding error of one operation.
 UNIT = 2.0**-53
+
+
+class Rows(NamedTuple):
+    """The rows of N nodes with A actions each, split into what all actions of a node have in common and the rest.
+
+    Attributes:
+        first, node, weight: row n A + a, the rest of action a of node n.
+        always, always_node, always_weight: row n, what its actions have in common.
+        shares_rows: (N,) bool, see above.
+    """
+
+    first: np.ndarray
+    node: np.ndarray
+    weight: np.ndarray
+    always: np.ndarray
+    always_node: np.ndarray
+    always_weight: np.ndarray
+    shares_rows: np.ndarray
 
 
 @interpreted_first()
@@ -52,21 +69,18 @@ def backward_order(first, previous, goal, order, distance):
 
 
 @interpreted_first()
-@kernel
-def sweep_in_place(rows, common, shares_rows, goal, order, count, j, mode):
-    """One sweep of j(n) = 1 + min_a sum p j, in place in the order given; j is 0 at the goal.
+@kernel(makes_arrays=False)
+def sweep_in_place(rows, goal, order, j, mode):
+    """One sweep of j(n) = 1 + min_a sum p j, in place over the nodes of `order`; j is 0 at the goal.
 
-    If mode is not None, also mode(n) = sum p mode under the action that is best for j. What all actions of a node
-    have in common is in its row of `common`, the rest in `rows` of each action.
+    If mode is not None, also mode(n) = sum p mode under the action that is best for j.
     Returns (largest change of j, sum f f, sum f g, sum g g): f, what j has gained, g, what mode has lost in the sweep.
     """
-    first, node, weight = rows
-    always, always_node, always_weight = common
+    first, node, weight, always, always_node, always_weight, shares_rows = rows
     num_actions = (len(first) - 1) // len(goal)
     change, shared_value, shared_mode = 0.0, -1.0, 0.0
     ff, fg, gg = 0.0, 0.0, 0.0
-    for i in range(count):
-        n = order[i]
+    for n in order:
         if goal[n]:
             continue
         # the same rows as an earlier node: the same values
@@ -112,23 +126,23 @@ def sweep_in_place(rows, common, shares_rows, goal, order, count, j, mode):
 
 
 @interpreted_first()
-@kernel
-def residual_bounds(rows, common, shares_rows, goal, order, count, high, low, policy, residual, error):
-    """(bound of T j - j, bound of j - T j, largest j) over nodes that are not the goal; T is one Bellman step.
+@kernel(makes_arrays=False)
+def residual_bounds(rows, goal, order, high, low, policy, residuals):
+    """(bound of T j - j, bound of j - T j, largest j) over nodes of `order` but the goal; T is one Bellman step.
 
     j = high; or j = high + low, two floats a node, so that j may be 1e16 times its differences. policy[n] = the action
-    that attains T j. residual, error (N,): T j - j, and by how much it may be off; None if low is.
+    that attains T j. residuals: two arrays (N,), T j - j, and by how much it may be off; None if low is.
 
     T j(n) - j(n) = 1 + min_a sum_m p(m | n, a) (j(m) - j(n)): written with differences, no rounding error grows with j
     itself. Both bounds count all rounding: `rounding_units` says how many units in the last place one sum may be off.
     The error of a difference of two pairs is a unit of the difference and eight units of a unit of the numbers.
     """
-    first, node, weight = rows
-    always, always_node, always_weight = common
+    first, node, weight, always, always_node, always_weight, shares_rows = rows
     num_actions = (len(first) - 1) // len(goal)
     above, below, largest, twin = 0.0, 0.0, 0.0, -1
-    for i in range(count):
-        n = order[i]
+    if low is not None:
+        residual, error = residuals
+    for n in order:
         if goal[n]:
             continue
         # the same rows and value as an earlier node: the same result
@@ -188,7 +202,7 @@ def rounding_units(num_actions, terms):
     return terms + num_actions + 24
 
 
-@kernel
+@kernel(makes_arrays=False)
 def _difference(high, low, m, value, correction):
     """(high[m] + low[m]) - (value + correction), to a unit of the difference; high[m] - value if low is None.
 
@@ -248,22 +262,20 @@ def almost_surely(first, node, rows, goal, sure, attractor, policy):
 
 @interpreted_first()
 @kernel
-def proper_policy(first, node, weight, num_actions, goal, order, count, sure, policy):
-    """policy[n] for n in order[:count]: an action that may lead nearer to the goal and never out of these nodes.
+def proper_policy(first, node, weight, num_actions, goal, order, policy):
+    """policy[n] for n in `order`: an action that may lead nearer to the goal and never out of these nodes.
 
     So the goal is reached surely. order: nodes by distance to the goal; all of them surely reach it. The action most
-    likely to lead nearer is taken. sure (N,) is scratch.
+    likely to lead nearer is taken.
     """
-    sure[:] = False
-    for i in range(count):
-        sure[order[i]] = True
+    sure, nearer = goal.copy(), goal.copy()
+    for n in order:
+        sure[n] = True
     # grow the set of nodes that have an action, from the goal on
-    nearer = goal.copy()
     grew = True
     while grew:
         grew = False
-        for i in range(count):
-            n = order[i]
+        for n in order:
             if nearer[n]:
                 continue
             # among the actions that stay in these nodes, the one most likely to enter the set
@@ -293,18 +305,69 @@ MASS_ROUNDING = 1e-12
 EPSILON = 2.0**-52
 
 
-@kernel
-def _execution(executed, choice, previous, weights):
+class OutcomeLists(NamedTuple):
+    """The outcomes of executing each action in each of N states, M in all.
+
+    Attributes:
+        first: (N + 1,) state x has the outcomes numbered first[x] to first[x + 1].
+        action, node, prob: (M,) if action[i] is executed (-1: any), it leads to node[i] with probability prob[i].
+        owner: (M,) the state of each.
+    """
+
+    first: np.ndarray
+    action: np.ndarray
+    node: np.ndarray
+    prob: np.ndarray
+    owner: np.ndarray
+
+
+class ExecutionWeights(NamedTuple):
+    """Weights of the executed action.
+
+    Attributes:
+        now, before, uniform: of the choice, of the previously executed action, and of each action.
+        first_now, first_uniform: the same if there is no previous action.
+        num_previous: number of previous actions that are told apart, 0 if they do not matter.
+        num_actions: A.
+    """
+
+    now: float
+    before: float
+    uniform: float
+    first_now: float
+    first_uniform: float
+    num_previous: int
+    num_actions: int
+
+
+class Ways(NamedTuple):
+    """Ways back to node[i], for outcomes i, from the other outcomes j of its state; as long as it has outcomes.
+
+    Attributes:
+        square: (M,) where the entries of outcome i in `steps` begin; -1: it has none.
+        steps: uint8, at square[i] + j the length of the way from outcome j of the state; NO_WAY if there is none.
+        start: (M,) where the ways of outcome i in `way` begin; (0,) before the ways are written.
+        way: the outcomes along the ways whose length is not NO_WAY, one way after another.
+    """
+
+    square: np.ndarray
+    steps: np.ndarray
+    start: np.ndarray
+    way: np.ndarray
+
+
+@kernel(makes_arrays=False)
+def _probability(executed, choice, previous, execution):
     """Probability that the action `executed` is executed if `choice` is chosen.
 
     executed = -1: whatever is executed. previous = -1: on the first step, or if it does not matter.
     """
     if executed < 0:
         return 1.0
-    now, before, uniform, first_now, first_uniform = weights
     if previous < 0:
-        return first_uniform + (first_now if executed == choice else 0.0)
-    return uniform + (now if executed == choice else 0.0) + (before if executed == previous else 0.0)
+        return execution.first_uniform + (execution.first_now if executed == choice else 0.0)
+    now, before = execution.now, execution.before
+    return execution.uniform + (now if executed == choice else 0.0) + (before if executed == previous else 0.0)
 
 
 @interpreted_first()
@@ -323,24 +386,25 @@ def outcomes_into(node, num_nodes):
     return first[:-1], outcome
 
 
-@kernel
-def _search_back(y, outcomes, owner, into, ball, levels, queue, via):
-    """Search backward from y, along outcomes: the nodes by their distance to y, at most `ball`, are queue[:result].
+@kernel(makes_arrays=False)
+def _search_back(y, outcomes, into, room):
+    """Search backward from y, along outcomes: the nodes by their distance to y are queue[:result].
 
-    levels[n] = distance + 1; via[n] = the outcome aimed at first on the way from n: the most probable one of those that
-    lead to the same node.
+    room: (levels (N,) uint8: distance + 1, zero before and after; queue: as many nodes as it holds; via (N,): the
+    outcome aimed at first on the way from each node, the most probable one of those that lead to the same node).
     """
-    _, _, node, prob = outcomes
+    levels, queue, via = room
+    node, prob, owner = outcomes.node, outcomes.prob, outcomes.owner
     into_first, into_outcome = into
     levels[y] = 1
     queue[0] = y
     head, tail = 0, 1
-    while head < tail and tail < ball and levels[queue[head]] < NO_WAY:
+    while head < tail and tail < len(queue) and levels[queue[head]] < NO_WAY:
         n = queue[head]
         head += 1
         for k in range(into_first[n], into_first[n + 1]):
             x = owner[into_outcome[k]]
-            if levels[x] == 0 and tail < ball:
+            if levels[x] == 0 and tail < len(queue):
                 levels[x] = levels[n] + 1
                 via[x] = into_outcome[k]
                 queue[tail] = x
@@ -351,28 +415,29 @@ def _search_back(y, outcomes, owner, into, ball, levels, queue, via):
 
 
 @interpreted_first()
-@kernel
-def ways_back(low, high, outcomes, owner, into, square, steps, start, way, ball, levels, queue, via):
+@kernel(makes_arrays=False)
+def ways_back(low, high, outcomes, into, ways, room):
     """Shortest ways back to node[i], for outcomes i into nodes low..high, from the other outcomes of its state.
 
-    If `way` is None: steps[square[i] + j] = length of the way from outcome j of the state to node[i]; NO_WAY where the
-    `ball` nodes nearest to node[i] do not include it. Else way[start[i]] on = the outcomes along the ways whose length
-    is not NO_WAY, one way after another. levels (N,) uint8 is zero before and after.
+    If `start` is empty their lengths are written to `steps`: NO_WAY if the nodes nearest to node[i] do not include the
+    outcome's. Else the ways are written to `way`. into: see `outcomes_into`; room: see `_search_back`.
     """
-    first, _, node, _ = outcomes
+    first, node, owner = outcomes.first, outcomes.node, outcomes.owner
     into_first, into_outcome = into
+    square, steps, start, way = ways
+    levels, queue, via = room
     for y in range(low, high):
-        size = _search_back(y, outcomes, owner, into, ball, levels, queue, via)
+        size = _search_back(y, outcomes, into, room)
         # each outcome i into y, and each other outcome j of the same state
         for k in range(into_first[y], into_first[y + 1]):
             i = into_outcome[k]
             x = owner[i]
             if square[i] < 0:
                 continue
-            at = start[i] if way is not None else 0
+            at = start[i] if len(start) > 0 else 0
             for j in range(first[x + 1] - first[x]):
                 n = node[first[x] + j]
-                if way is None:
+                if len(start) == 0:
                     steps[square[i] + j] = levels[n] - 1 if levels[n] > 0 else NO_WAY
                 elif steps[square[i] + j] != NO_WAY:
                     while n != y:
@@ -385,14 +450,15 @@ def ways_back(low, high, outcomes, owner, into, square, steps, start, way, ball,
 
 
 @interpreted_first()
-@kernel
-def keep_near(outcomes, owner, weights, num_previous, square, steps, limit, length):
+@kernel(makes_arrays=False)
+def keep_near(outcomes, execution, ways, limit, length):
     """Drop the longest ways back until the expected steps on the way back are at most `limit`, for every outcome.
 
-    steps: NO_WAY if dropped; length[i] becomes the sum of the lengths of the ways that are left. Returns the largest
-    expected number of steps.
+    Lengths of dropped ones become NO_WAY; length[i] becomes the sum of the lengths of the ways that are left. Returns
+    the largest expected number of steps.
     """
-    first, action, node, prob = outcomes
+    first, action, node, prob, owner = outcomes
+    square, steps, _, _ = ways
     largest = 0.0
     for i in range(len(node)):
         low, high = first[owner[i]], first[owner[i] + 1]
@@ -400,11 +466,11 @@ def keep_near(outcomes, owner, weights, num_previous, square, steps, limit, leng
         while square[i] >= 0:
             # expected steps on ways back, the largest over the previously executed action
             worst = 0.0
-            for previous in range(-1, num_previous):
+            for previous in range(-1, execution.num_previous):
                 total = 0.0
                 for j in range(low, high):
                     if steps[square[i] + j - low] != NO_WAY:
-                        chance = prob[j] * _execution(action[j], action[i], previous, weights)
+                        chance = prob[j] * _probability(action[j], action[i], previous, execution)
                         total += chance * steps[square[i] + j - low]
                 worst = max(worst, total)
             if worst <= limit:
@@ -418,6 +484,7 @@ def keep_near(outcomes, owner, weights, num_previous, square, steps, limit, leng
             for j in range(low, high):
                 if steps[square[i] + j - low] == farthest:
                     steps[square[i] + j - low] = NO_WAY
+        # the room that the ways which are left take
         if square[i] >= 0:
             for j in range(low, high):
                 if steps[square[i] + j - low] != NO_WAY:
@@ -426,24 +493,25 @@ def keep_near(outcomes, owner, weights, num_previous, square, steps, limit, leng
 
 
 @interpreted_first()
-@kernel
-def attempt_costs(
-    begin, end, outcomes, owner, weights, num_previous, square, steps, start, way, constant, times, value, new, once
-):
+@kernel(makes_arrays=False)
+def attempt_costs(begin, end, outcomes, execution, ways, costs, once):
     """new[i] = constant + the expected cost of the outcomes that happen if outcome i is aimed at.
 
     Another outcome costs the sum of `value` along its way back to node[i], if there is one, else `times` of the node
     that it leads to. The largest expectation over the previously executed action counts. Returns the largest increase.
     `once`: also for outcomes without any way back, which depend on no values: they are worked out in one pass and stay
-    as they are.
+    as they are. costs: (constant; times (N,); value, new (M,): of the attempts, before and after this pass).
     """
-    first, action, node, prob = outcomes
+    first, action, node, prob, owner = outcomes
+    square, steps, start, way = ways
+    constant, times, value, new = costs
     increase, mean = 0.0, 0.0
     for i in range(begin, end):
         low, high = first[owner[i]], first[owner[i] + 1]
         if square[i] < 0 and not once:
             continue
-        if square[i] < 0 and action[i] < 0:  # whatever is chosen: of all outcomes only this one does not lead elsewhere
+        # whatever is chosen: of all outcomes only this one does not lead elsewhere
+        if square[i] < 0 and action[i] < 0:
             if i in (low, begin):
                 mean = 0.0
                 for j in range(low, high):
@@ -451,15 +519,16 @@ def attempt_costs(
             new[i] = constant + max(mean - prob[i] * times[node[i]], 0.0) + (high - low + 2) * EPSILON * mean
             increase = max(increase, new[i] - value[i])
             continue
-        if node[i] == owner[i]:  # an outcome that stays is on no shortest way, so that no sum takes its entry
+        # an outcome that stays is on no shortest way, so that no sum takes its entry
+        if node[i] == owner[i]:
             continue
         # expected cost, by the outcomes j that may happen: a way back, or giving up
         worst = 0.0
-        for previous in range(-1, num_previous):
+        for previous in range(-1, execution.num_previous):
             total = constant
             at = start[i]
             for j in range(low, high):
-                chance = prob[j] * _execution(action[j], action[i], previous, weights)
+                chance = prob[j] * _probability(action[j], action[i], previous, execution)
                 if square[i] >= 0 and steps[square[i] + j - low] != NO_WAY:
                     back = 0.0
                     for _ in range(steps[square[i] + j - low]):
@@ -519,29 +588,26 @@ UPDATES = 1 + 1e-9
 
 
 @kernel
-def shorten(targets, begin, end, graph, chance, times, bound, new, sweeps, scratch):
-    """new[z] for z in targets[begin:end]: the least of bound[z] and (bound[x] + c(x)) / (1 - l(x)) over x around z.
+def shorten(targets, outcomes, into, execution, hub, sweeps, room):
+    """new[z] for z in targets: the least of bound[z] and (bound[x] + c(x)) / (1 - l(x)) over x around z.
 
     c(x): expected steps from x until z is reached or the nodes around z are left, and then to the hub; l(x):
     probability that they are left. hardness/stochastic_diameter.py proves the bound.
 
-    graph: (outcomes, owner, into, steps from the hub to each node (N,)); chance: (weights, previous actions, actions).
-    times (N,): expected steps from each node to the hub, at most; bound (N,): from the hub to each node, at most.
-    scratch: (index (N,) int32, zero before and after; queue, an entry for each node around z; pushed and turns, those
-    of `_around`; cost and leak, one for each previously executed action as well, the last for none). x is reached with
-    any of those, so c(x) is the largest.
+    hub: (steps (N,), the fewest from the hub to each node; times, bound (N,), expected steps from each node to the hub
+    and from the hub to it, at most; new (N,)). into: see `outcomes_into`. room: (index, queue, pushed, turns: see
+    `_around`; cost, leak: (nodes, previous actions + 1), c(x) and l(x) after each previously executed action, the last
+    for none). x is reached with any of those, so c(x) is the largest.
     """
-    outcomes, owner, into, steps = graph
-    weights, num_previous, num_actions = chance
-    index, queue, pushed, turns, cost, leak = scratch
-    first, action, node, prob = outcomes
+    first, action, node, prob, owner = outcomes
+    now, before, uniform, first_now, first_uniform, num_previous, num_actions = execution
+    steps, times, bound, new = hub
+    index, queue, pushed, _, cost, leak = room
     none = cost.shape[1] - 1
-    now, before, uniform, first_now, first_uniform = weights
     by_cost, by_leak = np.zeros(num_actions), np.zeros(num_actions)
-    for k in range(begin, end):
-        z = targets[k]
+    for z in targets:
         # the nodes around z; at first each of them gives up at once: c = times, l = 1, and 0 at z
-        size, count = _around(z, owner, into, steps, index, (queue, pushed, turns))
+        size, count = _around(z, owner, into, steps, room)
         guess = min(bound[z], 1e300)
         for i in range(size):
             cost[i], leak[i] = times[queue[i]], 1.0
@@ -598,15 +664,16 @@ def shorten(targets, begin, end, graph, chance, times, bound, new, sweeps, scrat
 
 
 @kernel
-def _around(z, owner, into, steps, index, scratch):
+def _around(z, owner, into, steps, room):
     """Collect nodes on the way to z, those on short ways from the hub first; returns (size, count of `pushed`).
 
-    queue[:size]: the nodes, as many as the queue holds; index[n]: the index of n in it, plus one; -1 while it waits. A
-    node of which z is k steps away, and that lies on a way from the hub to z that is s steps longer than the shortest
-    one, comes k + DETOUR s-th: its steps to z count, and those lost. A queue of buckets: `turns` has the first node of
-    each of the next MOST_TURNS turns, `pushed` are (node, the next of its turn).
+    queue[:size]: the nodes, as many as the queue holds; index[n], int32: the index of n in it, plus one; -1 while it
+    waits; zero before, and the caller makes it so again. A node of which z is k steps away, and that lies on a way from
+    the hub to z that is s steps longer than the shortest one, comes k + DETOUR s-th: its steps to z count, and those
+    lost. A queue of buckets: `turns` has the first node of each of the next MOST_TURNS turns, `pushed` are (node, the
+    next of its turn).
     """
-    queue, pushed, turns = scratch
+    index, queue, pushed, turns, _, _ = room
     into_first, into_outcome = into
     turns[:] = -1
     pushed[0, 0], pushed[0, 1], turns[0] = z, -1, 0

@@ -1,9 +1,9 @@
 """Backward passes for the effective horizons of deterministic MDPs, and tail bounds of means, for GORP.
 
-next_states (S, A), -1 if the episode ends; rewards (S, A) float64. An episode that has ended is worth 0.
+next_states (S, A), -1 if the episode ends. rewards (S, A) float64. An episode that has ended is worth 0.
 
 Tails bound the probability that each of several means of m samples is the largest, from bounds on their tails. Each
-distribution is cut into 100 parts of equal probability; `low` and `high` enclose the part. For N rows of n means:
+distribution is cut into 100 parts of equal probability. `low` and `high` enclose the part. For N rows of n means:
 lower[i, a] = sum over parts of 1/100 prod over b != a of P(mean b < low), upper the same with P(mean b <= high).
 """
 
@@ -20,7 +20,7 @@ from pharos.kernels.kernel_cache import kernel
 def step_values(next_states, rewards, tie, best, worst, explored, best_now, worst_now, explored_now, optimal, variance):
     """One step backwards: the values of optimal, worst and uniform play, and two inputs of the simple bound.
 
-    best, worst, explored (S,): of the step after; *_now (S,): of this step. optimal (S,) unsigned: bit a where Q*(s, a)
+    best, worst, explored (S,): of the step after. *_now (S,): of this step. optimal (S,) unsigned: bit a where Q*(s, a)
     is within `tie` of the best. variance (S,): max over a of (Q^e - Q^w) (Q* - Q^w).
     """
     num_actions = next_states.shape[1]
@@ -96,7 +96,7 @@ def step_along(next_states, rewards, after, optimal, variance, log, near, nodes,
 
     after (S,): Q(s, a) = r(s, a) + after(next state). is_visited (S,) bool, all False before and after. hardest
     (3,): 16 variance log / gap^2 of the node that has the largest, the first among equals, and its gap and variance.
-    Returns how many states `next_nodes` holds; -1 if an action that is not optimal may be taken.
+    Returns how many states `next_nodes` holds, -1 if an action that is not optimal may be taken.
     """
     num_actions = next_states.shape[1]
     count, at, fails = 0, -1, False
@@ -165,7 +165,7 @@ def _quantile(probability, m, width, variance):
 
 @kernel
 def bernstein(means, widths, m, lower, upper):
-    """Tail bounds for means of samples in intervals of length `widths` (N, n); writes lower and upper (N, n).
+    """Tail bounds for means of samples in intervals of length `widths` (N, n). Writes lower and upper (N, n).
 
     The variance of a sample is at most (best - mean) (mean - worst), which is in `upper` before.
     """

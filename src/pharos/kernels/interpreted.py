@@ -2,7 +2,7 @@
 
 `interpreted_first` makes a kernel count the entries that its calls read. As long as they are few, and the kernel is not
 compiled, Python runs its text, and the text of the functions it calls: the same operations on the same numbers, so the
-same bits. (NumPy adds 1 to 32-bit integers in 32 bits and Numba in 64; few entries do not come that far.)
+same bits. (NumPy adds 1 to 32-bit integers in 32 bits and Numba in 64. Few entries do not come that far.)
 """
 
 from collections.abc import Callable
@@ -55,7 +55,7 @@ def interpreted_first(*counted: str) -> Callable:
     compiled kernel is on disk, as loading takes so much less than compiling.
 
     Args:
-        counted: arguments whose entries count, a whole number as so many; none: all arrays. The work of a call must not
+        counted: arguments whose entries count, a whole number as so many. None: all arrays. The work of a call must not
             grow faster.
     """
 
@@ -92,7 +92,7 @@ def _as_python(result: object) -> object:
 
 
 def _entries(argument: object) -> int:
-    """Number of entries of an argument: of an array, of the arrays of a tuple; a whole number counts as itself."""
+    """Number of entries of an argument: of an array, of the arrays of a tuple. A whole number counts as itself."""
     if isinstance(argument, tuple):
         return sum(getattr(each, "size", 0) for each in argument)
     return int(argument) if isinstance(argument, int | np.integer) else getattr(argument, "size", 0)

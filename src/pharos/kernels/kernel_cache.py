@@ -77,7 +77,7 @@ class KernelCache(NullCache):
         return self._is_there
 
     def load_overload(self, sig: object, target_context: TargetContext) -> CompileResult | None:
-        """The compiled kernel of a signature; None if there is none, or a damaged one, which is deleted."""
+        """The compiled kernel of a signature. None if there is none, or a damaged one, which is deleted."""
         target_context.refresh()
         file = self._file(sig, target_context.codegen())
         try:
@@ -94,7 +94,7 @@ class KernelCache(NullCache):
             return None
 
     def save_overload(self, sig: object, cres: Any) -> None:
-        """Write a compiled kernel to disk; without room for it, the next process compiles again."""
+        """Write a compiled kernel to disk. Without room for it, the next process compiles again."""
         if cres.lifted or cres.library.has_dynamic_globals:  # it refers to addresses of this process
             return
         data = dumps(cres._reduce())
@@ -113,12 +113,12 @@ def is_on_disk(dispatcher: Callable) -> bool:
 
 
 def cache_in(folder: Path | None, name: str) -> NullCache:
-    """The cache of the kernel with this name in a folder; without a folder, one that stores nothing."""
+    """The cache of the kernel with this name in a folder. Without a folder, one that stores nothing."""
     return NullCache() if folder is None else KernelCache(folder / name)
 
 
 def folder_of_rules() -> Path | None:
-    """The folder of kernels that are made of rules, private to this user; None: there is none."""
+    """The folder of kernels that are made of rules, private to this user. None: there is none."""
     return private_folder(storage.cache_directory())
 
 
@@ -165,7 +165,7 @@ inlined = called_by_kernels(forceinline=True)
 
 @cache
 def _folder() -> Path | None:
-    """The folder of the kernels with the texts of today; folders of other texts are deleted after UNUSED_DAYS."""
+    """The folder of the kernels with the texts of today. Folders of other texts are deleted after UNUSED_DAYS."""
     named = os.environ.get("NUMBA_CACHE_DIR")
     root = Path(named).expanduser() if named else folder_of_rules()
     if root is None:

@@ -38,7 +38,7 @@ def subtract_from(y, out):
 
 @kernel
 def add_scaled(x, factor, y):
-    """x += factor y, in place; returns the sum of x."""
+    """x += factor y, in place. Returns the sum of x."""
     total = 0.0
     for i in range(len(x)):
         x[i] += factor * y[i]
@@ -48,7 +48,7 @@ def add_scaled(x, factor, y):
 
 @kernel
 def next_direction(direction, beta, omega, moved, residual):
-    """direction = residual + beta (direction - omega moved), in place; returns its sum."""
+    """direction = residual + beta (direction - omega moved), in place. Returns its sum."""
     total = 0.0
     for i in range(len(direction)):
         direction[i] = residual[i] + beta * (direction[i] - omega * moved[i])
@@ -63,7 +63,7 @@ def next_direction(direction, beta, omega, moved, residual):
 def entries_of_factor(first, columns, limit, starts=None, rows=None):
     """(N,) entries below the diagonal in each column of the factor of a matrix whose pattern is symmetric.
 
-    Row i of the matrix has its entries in columns[first[i] : first[i + 1]]; pivots are taken in order. In place of the
+    Row i of the matrix has its entries in columns[first[i] : first[i + 1]]. Pivots are taken in order. In place of the
     counts of all rows those so far are returned as soon as their sum passes the limit. Unless they are None, rows holds
     the rows of the entries of column j from starts[j] on, in order.
 
@@ -119,8 +119,8 @@ def project(features, z, out):
 def step(features, diagonal, weights, rate, projected, now, past, out):
     """One term of a Chebyshev series: past = 2 now - 4 rate K (weights now) - past, in place.
 
-    projected (A, M) float32 = (F' (weights now))'; out (A, M) float64 = the same of the new term. now, past, weights
-    (C, A) float32; diagonal (C, 1).
+    projected (A, M) float32 = (F' (weights now))', and out (A, M) float64 = the same of the new term. now, past,
+    weights (C, A) float32; diagonal (C, 1).
     """
     part = np.zeros(out.shape, np.float32)
     out[:] = 0.0
@@ -146,7 +146,7 @@ def step(features, diagonal, weights, rate, projected, now, past, out):
 
 @kernel(fastmath={"reassoc", "contract", "nsz"})
 def product(matrix, z, out):
-    """out (A, C) = z matrix, of a symmetric matrix (C, C) float32 and z (A, C), with float64 sums; the upper half of
+    """out (A, C) = z matrix, of a symmetric matrix (C, C) float32 and z (A, C), with float64 sums. The upper half of
     the matrix is not read. z, out: float64. Two rows of the matrix go over z at once."""
     out[:] = 0.0
     # rows s and s + 1, left of the diagonal: each entry counts for its row and, mirrored, for its column

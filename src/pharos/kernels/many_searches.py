@@ -16,7 +16,7 @@ def search_from_many(table, reverse, start, sources, origins, front, coming, que
 
     table, reverse: as `graph.search` has them.
 
-    origins, front, coming: (N, W) uint64, zero before; front and coming are zero again afterwards, origins[v] has the
+    origins, front, coming: (N, W) uint64, zero before. front and coming are zero again afterwards, origins[v] has the
     bits of the sources that reach v. queue, other: (N,) scratch. largest (len(sources),): their eccentricities among
     what they reach. Returns (pairs reached, table entries read).
     """
@@ -68,7 +68,7 @@ def search_from_many(table, reverse, start, sources, origins, front, coming, que
 
 @kernel
 def _push(u, v, origins, front, coming, other, size):
-    """Pass the bits of u that v lacks on to v; v joins the next level, of `size` nodes, once. Returns its size."""
+    """Pass the bits of u that v lacks on to v. v joins the next level, of `size` nodes, once. Returns its size."""
     waiting, adds = np.uint64(0), np.uint64(0)
     for w in range(origins.shape[1]):
         waiting |= coming[v, w]
@@ -83,7 +83,7 @@ def _push(u, v, origins, front, coming, other, size):
 
 @kernel
 def _settle(queue, count, other, size, origins, front, coming, level, largest, width):
-    """Make the next level the current one; record it as the eccentricity of every source that reached something.
+    """Make the next level the current one. Record it as the eccentricity of every source that reached something.
 
     Returns the pairs (source, node) reached on the next level.
     """
@@ -125,11 +125,12 @@ WORDS = 8  # of 64 sources: a cache line
 
 @kernel
 def dense_search_backward(next_states, ends, start, sources, origins, front, coming, active, arriving, largest):
-    """largest[i] = the largest distance to sources[i] of a node that leads there; at most 512 sources, a bit for each.
+    """largest[i] = the largest distance to sources[i] of a node that leads there, for at most 512 sources, a bit for
+    each.
 
     Every node reads, level by level, what its successors have reached: one cache line for each edge on a level where
-    the successor has new bits; it writes its own alone. A node that leads to all sources reads no more.
-    origins, front, coming: (N, 8) uint64, active, arriving: (N,) bool; zero before.
+    the successor has new bits. It writes its own alone. A node that leads to all sources reads no more.
+    origins, front, coming: (N, 8) uint64, active, arriving: (N,) bool, zero before.
     Returns the number of lines read from successors.
     Source: Then et al. (2014), bit-parallel search; Beamer, Asanovic and Patterson (2012), bottom-up steps.
     """
@@ -192,7 +193,7 @@ def dense_search_backward(next_states, ends, start, sources, origins, front, com
 
 @kernel
 def spread_out(next_states, ends, order, blocked, limit):
-    """The first nodes of `order`, at most `limit`, none of them a successor of one before; blocked (N,) bool, zero."""
+    """The first nodes of `order`, at most `limit`, none of them a successor of one before. blocked: (N,) bool, zero."""
     selection = np.empty(limit, order.dtype)
     count = 0
     for i in range(len(order)):
@@ -228,7 +229,8 @@ def num_successors(next_states, ends, num_nodes):
 
 @kernel
 def lower_along_edges(next_states, ends, start, in_upper, out_upper):
-    """One pass of in(v) <= 1 + in(u) and out(u) <= 1 + out(v) over the edges (u, v); whether a bound got lower."""
+    """One pass of in(v) <= 1 + in(u) and out(u) <= 1 + out(v) over the edges (u, v). Return whether a bound got
+    lower."""
     num_states, num_actions = next_states.shape
     lowered = False
     for u in range(len(in_upper)):
@@ -248,7 +250,7 @@ def lower_along_edges(next_states, ends, start, in_upper, out_upper):
 
 @kernel
 def _successor(next_states, start, v, a, is_end):
-    """The node that v leads to by a: `start`, or -1, if v is an end; node S if a ends the episode."""
+    """The node that v leads to by a: `start`, or -1, if v is an end, and node S if a ends the episode."""
     if is_end:
         return start
     u = np.int64(next_states[v, a])

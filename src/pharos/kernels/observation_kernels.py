@@ -1,8 +1,8 @@
 """Observations by the components of a block of states alone, without rules, and tangent kernels of observations.
 
 Neural tangent kernels of one block of pairs (x, y) of observations, I times J of them: q: covariance of the
-pre-activations of a layer; theta: its tangent kernel; variance_x (I,), variance_y (J,): q of x with itself. Of a ReLU,
-E[f(u) f(v)] and E[f'(u) f'(v)] are arc-cosine kernels (Cho and Saul, 2009); of a hyperbolic tangent they are power
+pre-activations of a layer. theta: its tangent kernel. variance_x (I,), variance_y (J,): q of x with itself. Of a ReLU,
+E[f(u) f(v)] and E[f'(u) f'(v)] are arc-cosine kernels (Cho and Saul, 2009). Of a hyperbolic tangent they are power
 series in the correlation, made of Hermite coefficients (Daniely, Frostig and Singer, 2016).
 """
 
@@ -74,7 +74,7 @@ RELU, TANH = 0, 1
 
 @kernel(inline="always")
 def _relu(q, scale):
-    """(E[f(u) f(v)], E[f'(u) f'(v)]) of a centred Gaussian pair of covariance q; scale: product of the deviations."""
+    """(E[f(u) f(v)], E[f'(u) f'(v)]) of a centred Gaussian pair of covariance q. scale: product of the deviations."""
     if scale <= 0.0:
         return 0.0, 0.0
     cosine = min(max(q / scale, -1.0), 1.0)
@@ -86,7 +86,7 @@ def _relu(q, scale):
 def _series(q, scale, a, b):
     """(E[f(u) f(v)], E[f'(u) f'(v)]) of an odd function, by its Hermite coefficients a, b (M,) of degree 1, 3, 5, ...
 
-    a, b: at the deviations of u and v; q: their covariance; scale: product of the deviations.
+    a, b: at the deviations of u and v. q: their covariance. scale: product of the deviations.
     """
     correlation = min(max(q / scale, -1.0), 1.0) if scale > 0.0 else 0.0
     power, value, slope = 1.0, 0.0, 0.0
@@ -103,7 +103,7 @@ def dense(q, theta, variances_x, variances_y, kinds, coefficients_x, coefficient
     """out (I, J) float32 = the tangent kernel of the output of dense layers, the last of them linear.
 
     q, theta (I, J): of the first hidden layer. variances_x (L, I), variances_y (L, J): of all hidden layers.
-    kinds (L,): RELU or TANH; coefficients_x (L, I, M), coefficients_y: of TANH. widths (L,): units. weights, biases
+    kinds (L,): RELU or TANH. coefficients_x (L, I, M), coefficients_y: of TANH. widths (L,): units. weights, biases
     (L,): variances of an entry of the following layer.
     """
     layers = len(widths)
@@ -127,7 +127,7 @@ def dense(q, theta, variances_x, variances_y, kinds, coefficients_x, coefficient
 def patches(gram, codes_x, codes_y, variance_x, variance_y, weight, bias, value, slope):
     """One position of a first convolution with ReLUs: value (I, J) = E[f f], slope (I, J) = E[f' f'] (gram + 1).
 
-    gram (U, V): inner products of the different patches; codes_x (I,), codes_y (J,): the patch that x and y have there.
+    gram (U, V): inner products of the different patches. codes_x (I,), codes_y (J,): the patch that x and y have there.
     variance_x (U,), variance_y (V,): of the different patches. weight, bias: variances of an entry.
     """
     # each pair of different patches once
@@ -149,7 +149,7 @@ def patches(gram, codes_x, codes_y, variance_x, variance_y, weight, bias, value,
 def gathered(value, slope, taps, filters, weight, bias, q, theta):
     """q, theta (I, J) of a unit that sees some positions of a convolution of `filters` filters: value, slope (P, I, J).
 
-    taps: indices of the positions; -1: padding. weight, bias: variances of an entry of this unit.
+    taps: indices of the positions, -1 for padding. weight, bias: variances of an entry of this unit.
     """
     q[:] = 0.0
     theta[:] = 0.0

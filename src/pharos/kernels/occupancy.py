@@ -70,7 +70,7 @@ def _execute(policy, weights, now, s, mass, executed):
 @interpreted_first()
 @kernel
 def push(transitions, live, policy, weights, now, after):
-    """after = the distribution one step later, without mass that has ended; returns the mass of live states."""
+    """after = the distribution one step later, without mass that has ended. Returns the mass of live states."""
     num_states, num_actions = size_of(transitions)
     after[:] = 0.0
     by_action = after.shape[1] > 1
@@ -100,7 +100,7 @@ def push(transitions, live, policy, weights, now, after):
 @interpreted_first()
 @kernel
 def count_visits(transitions, live, policy, weights, gamma, least, waiting, visits):
-    """Count the mass that waits in each state as a visit, and move it on; from the first state to the last, in place.
+    """Count the mass that waits in each state as a visit, and move it on, from the first state to the last, in place.
 
     waiting (S, W): discounted mass that has come and has not moved on. visits (S, W): sum over t of gamma^t P(s_t = s),
     of the mass that has moved on. Masses below `least` stay. Returns the mass that waits in the end.

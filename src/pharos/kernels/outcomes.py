@@ -1,7 +1,7 @@
 """Outcomes of executing an action, for loops that need not know how they are stored.
 
 `PackedIndices` are read like arrays of int64, entry by entry. So a loop over `next_states[s, a]` is written once, and
-Numba compiles it for each width of the indices; its code for int32 and int64 is the same as without them. They cannot
+Numba compiles it for each width of the indices. Its code for int32 and int64 is the same as without them. They cannot
 be written to here, nor returned.
 
 Kernels take `transitions`, one of three things:
@@ -21,7 +21,7 @@ their indices are unsigned, as signed ones would be checked at each read for cou
 State spaces store the possible outcomes, row after row, and their probabilities as codes of a palette. Row s A + a
 belongs to action a in state s. Probabilities are compared as their bits, uint64: 0 is an impossible outcome. The
 palette (capacity, K) uint64 has the distinct rows of probabilities, the possible ones in their order, then zeros,
-numbered in the order in which they appear; a table of slots finds them by their hash. K is the most outcomes of a row.
+numbered in the order in which they appear. A table of slots finds them by their hash. K is the most outcomes of a row.
 """
 
 import operator
@@ -115,7 +115,7 @@ UNROLLED_FROM = 100_000
 
 def is_unrolled(num_states):
     """Whether sweeps over so many states are compiled for their very numbers of actions and outcomes, and kinds of
-    rewards; else one compiled form serves all."""
+    rewards. Otherwise one compiled form serves all."""
     return num_states >= UNROLLED_FROM
 
 
@@ -170,7 +170,7 @@ def _typed_outcome_numbers(transitions, s, a):
 
 
 def outcome(transitions, s, a, k):
-    """(next state, -1 for the end; probability) of outcome k of (s, a)."""
+    """(next state or -1 for the end, probability) of outcome k of (s, a)."""
 
 
 @overload(outcome)
@@ -224,7 +224,7 @@ def _typed_outcome_index(transitions, row, k):
 
 
 def expectation(transitions, v, s, a):
-    """The mean of v (S + 1,), or of v (S + 1, A) at a, over what (s, a) leads to; -1 reads the last entry."""
+    """The mean of v (S + 1,), or of v (S + 1, A) at a, over what (s, a) leads to. -1 reads the last entry."""
 
 
 @overload(expectation)
@@ -260,7 +260,7 @@ def _value_of(v, s, a):
 
 
 def fetch_values(transitions, v, actions, s):
-    """Ask the processor to fetch the entries of v that `expectation` reads for state s; actions: see bellman.py."""
+    """Ask the processor to fetch the entries of v that `expectation` reads for state s. actions: see bellman.py."""
 
 
 @overload(fetch_values, jit_options={"forceinline": True})
@@ -278,7 +278,7 @@ def _fetch_values(transitions, v, actions, s):
 @interpreted_first("states")
 @kernel
 def expected(transitions, x, states, out):
-    """out[i, a] = the mean of x (S + 1, W, M) over what (states[i], a) leads to; W = A by executed action, or 1.
+    """out[i, a] = the mean of x (S + 1, W, M) over what (states[i], a) leads to. W = A by executed action, or 1.
 
     Outcomes that are impossible do not count, whatever x says there.
     """
@@ -295,7 +295,7 @@ def expected(transitions, x, states, out):
 
 @kernel
 def entries(transitions, states, actions, index, next_states, probabilities):
-    """The possible outcomes of (states[i], actions[i]), in order; returns how many there are.
+    """The possible outcomes of (states[i], actions[i]), in order. Returns how many there are.
 
     index[j] = i, next_states[j], probabilities[j]: of outcome j.
     """
@@ -312,7 +312,7 @@ def entries(transitions, states, actions, index, next_states, probabilities):
 @interpreted_first()
 @kernel
 def push_forward(transitions, mass, out):
-    """out (S, W) += the mass (S, A) of executed actions, moved to their next states; mass that ends is left out."""
+    """out (S, W) += the mass (S, A) of executed actions, moved to their next states. Mass that ends is left out."""
     by_action = out.shape[1] > 1
     for s in range(mass.shape[0]):
         for a in range(mass.shape[1]):
@@ -373,7 +373,7 @@ def _drawn_outcome(transitions, s, a, u):
 
 @kernel
 def drawn(transitions, s, a, u):
-    """The next state of (s, a), -1 for the end, drawn by u in [0, 1); probabilities need not sum to 1."""
+    """The next state of (s, a), -1 for the end, drawn by u in [0, 1). Probabilities need not sum to 1."""
     total = 0.0
     for k in outcome_numbers(transitions, s, a):
         total += outcome(transitions, s, a, k)[1]
@@ -409,9 +409,9 @@ _SEED = uint64(0x9E3779B97F4A7C15)
 
 @kernel
 def possible(successors, bits, num_actions, out, out_bits, counts):
-    """Write the possible outcomes of some states one after another; returns how many there are, N.
+    """Write the possible outcomes of some states one after another. Returns how many there are, N.
 
-    successors (rows, A K), bits (rows, A K): of all outcomes; out, out_bits (at least N,): of the possible ones; counts
+    successors (rows, A K), bits (rows, A K): of all outcomes. out, out_bits (at least N,): of the possible ones. counts
     (rows * A,): possible outcomes of each row.
     """
     rows, branches = successors.shape
@@ -430,10 +430,10 @@ def possible(successors, bits, num_actions, out, out_bits, counts):
 
 @kernel
 def encode(bits, counts, first_row, first, palette, size, table, codes):
-    """codes[r] = the palette's code of row r's probabilities, for the rows from `first_row` on; new ones are entered.
+    """codes[r] = the palette's code of row r's probabilities, for the rows from `first_row` on. New ones are entered.
 
-    bits (N,): of the probabilities; those of row `first_row` begin at `first`. Returns (row, first, size) of the first
-    row that finds the palette full; row is len(counts) if there is none.
+    bits (N,): of the probabilities. The bits of row `first_row` begin at `first`. Returns (row, first, size) of the
+    first row that finds the palette full. row is len(counts) if there is none.
     """
     capacity, num_outcomes = palette.shape
     slots = table.shape[0]
@@ -499,7 +499,7 @@ def _is(palette, code, bits, first, n):
 def padded(values, counts, fill_with_first, out):
     """out[r] (K,) = the values of row r, then its first value again, or zeros.
 
-    values (N,): row after row; counts (rows,); out (rows, K).
+    values (N,): row after row. counts: (rows,). out: (rows, K).
     """
     first = 0
     for row in range(len(counts)):

@@ -1,10 +1,10 @@
-"""Partitions of states: equal rows get equal numbers; classes split by the classes that their members lead to.
+"""Partitions of states: equal rows get equal numbers, and classes split by the classes that their members lead to.
 
 Exact: hashes only narrow the search, and rows are compared entry by entry. `slots` is a hash table of at least twice as
 many entries as rows, -1 if empty, that is empty again after each call.
 
 Under transition probabilities classes split by the probabilities of reaching classes, into the coarsest stable
-partition. Rows form a sparse matrix, row s A + a of state s and action a; columns from S on are no state. Two
+partition. Rows form a sparse matrix, row s A + a of state s and action a. Columns from S on are no state. Two
 rows are equal if they reach every class with the same probability, rounded to 2^-40, so that the order of additions
 does not matter. Members of a class lie side by side in `elements`. Of the groups into which it falls the largest keeps
 its number, and only states that lead to a class with a new number are looked at again, the candidates of the next
@@ -21,9 +21,9 @@ from pharos.kernels.kernel_cache import kernel
 
 @kernel
 def number_rows(rows, before, slots, numbers):
-    """numbers[i] = the same for equal pairs (before[i], rows[i]), counted in the order of appearance; returns how many.
+    """numbers[i] = the same for equal pairs (before[i], rows[i]), counted in the order of appearance. Returns how many.
 
-    rows (N, W) uint8; before, numbers (N,) int64.
+    rows: (N, W) uint8. before, numbers: (N,) int64.
     """
     mask = len(slots) - 1
     count = 0
@@ -74,7 +74,7 @@ def slots_for(rows):
 
 @kernel
 def affected_states(next_states, changed, candidates):
-    """candidates[:n] = the states with a next state that changed its class; returns n."""
+    """candidates[:n] = the states with a next state that changed its class. Returns n."""
     n = 0
     for s in range(len(next_states)):
         for a in range(next_states.shape[1]):
@@ -88,11 +88,11 @@ def affected_states(next_states, changed, candidates):
 
 @kernel
 def split_classes(next_states, classes, sizes, count, candidates, n, slots, used, new, changed):
-    """Split classes by the classes that the candidates lead to; returns the number of classes.
+    """Split classes by the classes that the candidates lead to. Returns the number of classes.
 
-    Members that are no candidates lead to what their class led to before, and keep its number; so does the first group
-    if all members are candidates. classes (S,), sizes (S,) members of each class; candidates (S,), of which the first n
-    count; used, new (S,) scratch; changed (S,) bool: whose class changed.
+    Members that are no candidates lead to what their class led to before, and keep its number. So does the first group
+    if all members are candidates. classes (S,), sizes (S,) members of each class. candidates (S,), of which the first n
+    count. used, new (S,) scratch. changed (S,) bool: whether the class changed.
     """
     mask = len(slots) - 1
     num_actions = next_states.shape[1]
@@ -159,7 +159,7 @@ UNITS = 2.0**40
 def predecessors(first, column, num_actions, edges, states):
     """states[edges[t]:edges[t + 1]] = the states that some action may lead to t.
 
-    edges (S + 1,), states (outcomes,). A counting sort; a state appears once for each outcome that leads to t.
+    edges (S + 1,), states (outcomes,). A counting sort, in which a state appears once for each outcome that leads to t.
     """
     size = len(edges) - 1
     edges[:] = 0
@@ -183,7 +183,7 @@ def predecessors(first, column, num_actions, edges, states):
 
 @kernel
 def _class_probabilities(matrix, row, classes, mass, keys):
-    """mass[c] = the probability of reaching class c, for the c in keys[:result]; mass is 0 before."""
+    """mass[c] = the probability of reaching class c, for the c in keys[:result]. mass is 0 before."""
     first, column, weight = matrix
     n = 0
     for k in range(first[row], first[row + 1]):
@@ -232,7 +232,7 @@ def _have_equal_rows(matrix, num_actions, s, other, classes, mass, keys, mass_of
 
 @kernel
 def refine(matrix, num_actions, into, classes, layout, slots):
-    """Split classes (S,), numbered from 0 without gaps, until nothing splits; returns the number of rounds.
+    """Split classes (S,), numbered from 0 without gaps, until nothing splits. Returns the number of rounds.
 
     The last round splits nothing. into: `predecessors`. layout: elements, index, begin, sizes, (S,) each, and slots, a
     power of 2 of at least 2 S that are all -1: scratch.
@@ -279,7 +279,7 @@ def refine(matrix, num_actions, into, classes, layout, slots):
 
 @kernel
 def _move_to_front(candidates, n, classes, layout, num_candidates, touched):
-    """Move the candidates to the front of their class, num_candidates[c] of them; returns how many classes have some.
+    """Move the candidates to the front of their class, num_candidates[c] of them. Returns how many classes have some.
 
     touched (S,): its first entries are these classes.
     """
@@ -301,7 +301,7 @@ def _move_to_front(candidates, n, classes, layout, num_candidates, touched):
 
 @kernel
 def _group_members(matrix, num_actions, c, k, classes, layout, groups, group_sizes, rows):
-    """group[j] of the first k members of class c, the candidates, by equal rows; returns how many groups.
+    """group[j] of the first k members of class c, the candidates, by equal rows. Returns how many groups.
 
     The others lead to what they led to before: one of them stands for all, and opens group 0.
     """
@@ -337,7 +337,7 @@ def _group_members(matrix, num_actions, c, k, classes, layout, groups, group_siz
 
 @kernel
 def _split(c, k, num_groups, count, layout, groups, group_sizes, renumbered, number, changed):
-    """Lay the groups of class c side by side and renumber all but the largest; returns (classes, renumbered states).
+    """Lay the groups of class c side by side and renumber all but the largest. Returns (classes, renumbered states).
 
     Group 0 comes last, beside the members that are no candidates.
     """
@@ -373,9 +373,9 @@ def _split(c, k, num_groups, count, layout, groups, group_sizes, renumbered, num
 
 @kernel
 def _lay_out(classes, layout):
-    """Lay the members of each class side by side; returns the number of classes.
+    """Lay the members of each class side by side. Returns the number of classes.
 
-    elements[begin[c]:begin[c] + sizes[c]]: the members of class c; s is at index[s].
+    elements[begin[c]:begin[c] + sizes[c]]: the members of class c. s is at index[s].
     """
     elements, index, begin, sizes = layout
     count = 0

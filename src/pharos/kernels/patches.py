@@ -25,7 +25,7 @@ SCATTER = 0x9E3779B97F4A7C15
 
 @kernel
 def _is_alike(one, pixel, other, at, channels, pixels):
-    """Whether a pixel of one picture has the colour of one of another; pictures (C pixels,)."""
+    """Whether a pixel of one picture has the colour of one of another. pictures: (C pixels,)."""
     for c in range(channels):
         if one[uint64(c * pixels + pixel)] != other[uint64(c * pixels + at)]:
             return False
@@ -34,7 +34,7 @@ def _is_alike(one, pixel, other, at, channels, pixels):
 
 @kernel
 def patch_keys(pictures, shape, keys):
-    """keys (pixels, B) int64: equal if patches are; pictures (B, C pixels), shape (C, H, W).
+    """keys (pixels, B) int64: equal if patches are. pictures (B, C pixels), shape (C, H, W).
 
     Seven bits for the number of each of nine colours. If there are more than COLOURS of them all keys differ.
     """
@@ -69,10 +69,10 @@ def patch_keys(pictures, shape, keys):
 
 @kernel
 def _grouped(keys, members, samples, slots):
-    """Put B pictures into groups by their keys (B,) at a pixel; return the number of groups.
+    """Put B pictures into groups by their keys (B,) at a pixel. Return the number of groups.
 
-    members (B,): the group of each picture; samples: a picture of each group.
-    slots: (keys, groups) of a hash table, all -1 before and after; (B,) indices of it that are in use.
+    members (B,): the group of each picture. samples: a picture of each group.
+    slots: (keys, groups) of a hash table, all -1 before and after, and (B,) indices of it that are in use.
     """
     slot_keys, slot_groups, used = slots
     mask, count = uint64(len(slot_keys) - 1), 0
@@ -92,7 +92,7 @@ def _grouped(keys, members, samples, slots):
 
 @kernel(fastmath={"contract"})
 def _convolve(picture, neighbours, kernel, bias, hidden):
-    """hidden (16,) = max(0, patch K + k); neighbours (9 C,): of a pixel in the picture, beyond its end if none."""
+    """hidden (16,) = max(0, patch K + k). neighbours (9 C,): of a pixel in the picture, beyond its end if none."""
     for f in range(FILTERS):
         hidden[f] = bias[f]
     for k in range(len(neighbours)):
@@ -107,7 +107,7 @@ def _convolve(picture, neighbours, kernel, bias, hidden):
 
 @kernel
 def _live(values, at):
-    """Write to `at` the indices of the values (n,) other than 0; return their number."""
+    """Write to `at` the indices of the values (n,) other than 0. Return their number."""
     count = 0
     for k in range(len(values)):
         at[count] = k
@@ -236,7 +236,7 @@ def _add_patch(picture, neighbours, dh, of_kernel):
 
 @kernel
 def backward(parameters, gradients, offsets, shape, indices, x, dy, memory):
-    """Write the gradients (W, P) of the four parameters; dy (W, B, outputs): of z, before the activation.
+    """Write the gradients (W, P) of the four parameters. dy (W, B, outputs): of z, before the activation.
 
     Everything else as `forward` has it.
     """

@@ -2,7 +2,7 @@
 
 The transitions and rewards of an action that is not available are the same as for the first available action of its
 state. So optimal and worst values, reachable states and the shortest times to them are computed as if every action
-existed, by the same kernels; only what counts, averages or lists actions reads the sets. See
+existed, by the same kernels. Only what counts, averages or lists actions reads the sets. See
 docs/decisions/0019-action-sets.md.
 
 In terminal states nothing is chosen, so all actions count as available there.
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def checked_sets(available: object, shape: tuple[int, int]) -> np.ndarray:
-    """(S, A) bool of an argument `available`; ParameterError if it is something else."""
+    """(S, A) bool of an argument `available`. ParameterError if it is something else."""
     array = array_argument(available, "available")
     is_truth = array.dtype == bool or (array.dtype.kind in "iu" and bool(np.isin(array, (0, 1)).all()))
     if array.shape != shape or not is_truth:
@@ -33,7 +33,7 @@ def checked_sets(available: object, shape: tuple[int, int]) -> np.ndarray:
 
 
 def sets_of(available: object, rewards: np.ndarray, shape: tuple[int, int]) -> np.ndarray | None:
-    """(S, A) bool, the available actions that rewards (S, A) do not pay -inf; None if all are."""
+    """(S, A) bool, the available actions that rewards (S, A) do not pay -inf. None if all are available."""
     sets = None if available is None else checked_sets(available, shape)
     if rewards.shape == shape and rewards.dtype.kind == "f" and rewards.size and rewards.min() == -np.inf:
         exists = rewards != -np.inf
@@ -42,13 +42,14 @@ def sets_of(available: object, rewards: np.ndarray, shape: tuple[int, int]) -> n
 
 
 def stand_ins(sets: np.ndarray) -> np.ndarray:
-    """(S, A) the action that each action acts as: itself, or the first available one; itself if there is none."""
+    """(S, A) the action that each action acts as: itself, or the first available one. Itself if there is none."""
     own = np.arange(sets.shape[1])
     return np.where(sets | ~sets.any(axis=1, keepdims=True), own, sets.argmax(axis=1)[:, None])
 
 
 def filled(array: np.ndarray, sets: np.ndarray) -> np.ndarray:
-    """An array (S, A, ...) with the entries of unavailable actions replaced; -inf without any such action by 0."""
+    """An array (S, A, ...) with the entries of unavailable actions replaced. If a state has no available action, -inf
+    by 0."""
     result = array[np.arange(len(sets))[:, None], stand_ins(sets)]
     return np.where(result == -np.inf, 0.0, result) if result.dtype.kind == "f" else result
 
@@ -78,7 +79,7 @@ def uniform_choice(mdp: "TabularMDP") -> np.ndarray:
 
 
 def most_actions(mdp: "TabularMDP") -> int:
-    """The largest number of actions that are available in a state that is not terminal; A if all are."""
+    """The largest number of actions that are available in a state that is not terminal, A if all are."""
     if mdp.available is None:
         return mdp.num_actions
     return int(mdp.available.sum(axis=1).max(where=~np.asarray(mdp.terminal), initial=1))
@@ -99,7 +100,7 @@ def drawn_actions(sets: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def check_choices(probabilities: np.ndarray, sets: np.ndarray | None, states: Iterable[int] | None = None) -> None:
-    """ParameterError if choices (N, A) or (N, B, A) have an unavailable action; sets (N, A), of states (N,)."""
+    """ParameterError if choices (N, A) or (N, B, A) have an unavailable action. sets: (N, A), of states (N,)."""
     if sets is None:
         return
     outside = ~sets if probabilities.ndim == 2 else ~sets[:, None]

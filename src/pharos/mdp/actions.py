@@ -51,7 +51,7 @@ class Selection(Protocol):
     def operations(self, num_actions: int) -> int: ...
 
     def value(self, q: np.ndarray, states: States = slice(None)) -> np.ndarray:
-        """(N, 1, ...) value of the choice, from q (N, A, ...) of some states; (N, A, ...) by the previous action."""
+        """(N, 1, ...) value of the choice, from q (N, A, ...) of some states, or (N, A, ...) by the previous action."""
 
     def first_value(self, q: np.ndarray, states: States = slice(None)) -> np.ndarray:
         """(N, 1, ...) value of the choice on the first step, without a previous action."""
@@ -90,7 +90,7 @@ class PolicyTable:
 
     Attributes:
         num_actions: A.
-        actions: (S,) the actions of a policy that is deterministic and looks at states alone; else None.
+        actions: (S,) the actions of a policy that is deterministic and looks at states alone, else None.
         probabilities: (S, B, A): B is 1, or A + 1 for each previously executed action and, last, for none.
     """
 
@@ -110,11 +110,11 @@ class PolicyTable:
         """Make the table of a policy in any form that users write.
 
         Args:
-            policy: (S,) integers, an action for each state; or (S, A) probabilities. Under sticky actions also (S, A +
-                1) integers or (S, A + 1, A) probabilities, for each previously executed action and, last, for none; or
-                a function from an array of state indices to any of these; None: uniform.
+            policy: (S,) integers, an action for each state, or (S, A) probabilities. Under sticky actions also (S, A +
+                1) integers or (S, A + 1, A) probabilities, for each previously executed action and, last, for none. Or
+                a function from an array of state indices to any of these. Default: uniform.
         Rows are divided by their sums in float64: rows of a float32 softmax sum to 1 within 1e-7 only, and the
-        difference would add up over the steps of an episode; `operations` counts the rounding of the division.
+        difference would add up over the steps of an episode. `operations` counts the rounding of the division.
         Raises:
             ParameterError: the shape is wrong, or rows are not probabilities that sum to 1 within 1e-6, or have an
                 action that is not available.
@@ -181,7 +181,7 @@ class PolicyTable:
 
 
 def mass_of(largest: float, num_actions: int) -> float:
-    """A bound on the sums of probabilities of choosing, from the largest one as floats add it up; at least 1."""
+    """A bound on the sums of probabilities of choosing, from the largest one as floats add it up, at least 1."""
     return max(1.0, largest * (1 + num_actions * 2.0**-53))
 
 
@@ -210,7 +210,7 @@ def _check_actions(mdp: "TabularMDP", actions: np.ndarray) -> None:
 
 
 def _rows_of_sum_one(mdp: "TabularMDP", table: np.ndarray) -> np.ndarray:
-    """Rows divided by their sums, in float64; those that sum to 1 as they are stay so to the bit."""
+    """Rows divided by their sums, in float64. Rows that sum to 1 as they are stay so to the bit."""
     num_states, num_actions = mdp.num_states, mdp.num_actions
     shapes = [(num_states, num_actions)] + ([(num_states, num_actions + 1, num_actions)] if mdp.is_sticky else [])
     if table.shape not in shapes:
@@ -232,16 +232,16 @@ def _rows_of_sum_one(mdp: "TabularMDP", table: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Chance:
-    """Weights of executing the chosen action, the previously executed one, or a uniform one; they sum to 1.
+    """Weights of executing the chosen action, the previously executed one, or a uniform one. They sum to 1.
 
     On the first step there is no previous action: the chosen one is executed with probability `first_chosen`, else a
     uniform one. (Only if random actions come before sticky ones, this differs from `chosen + previous`.)
 
-    If some actions are not available, the uniform action is one of the available ones; and a previous one that is not
-    counts as none: the step is as the first one.
+    If some actions are not available, the uniform action is one of the available ones. A previous one that is not
+    available counts as none, as in the first step.
 
     Attributes:
-        available: (N, A) bool, the sets of the states that values and distributions are of, see `at`; None: all.
+        available: (N, A) bool, the sets of the states that values and distributions are of, see `at`. None: all.
     """
 
     chosen: float = 1.0
@@ -325,7 +325,7 @@ class Chance:
         return float(self.uniform), read_only(self.available)
 
     def at(self, states: States) -> "Chance":
-        """The chance in some states, of which the methods below take rows; the same if all actions are available."""
+        """The chance in some states, of which the methods below take rows. The same if all actions are available."""
         return self if self.available is None else replace(self, available=self.available[states])
 
     def width(self, num_actions: int) -> int:
@@ -335,13 +335,13 @@ class Chance:
     # What it does -----------------------------------------------------------------------------------------------------
 
     def choice(self, q: np.ndarray, value: np.ndarray) -> np.ndarray:
-        """(N, W, ...): the value of the executed action, given the value of the chosen one; W previous actions.
+        """(N, W, ...): the value of the executed action, from the value of the chosen one, for W previous actions.
 
             V(s, b) = chosen value(s, b) + previous q(s, b) + uniform mean_x q(s, x)
 
         Args:
             q: (N, A, ...), the values of executing each action.
-            value: (N, 1, ...), the value of the chosen action; (N, A, ...) if the choice depends on the previous
+            value: (N, 1, ...), the value of the chosen action. (N, A, ...) if the choice depends on the previous
                 action.
         """
         result = self.chosen * value
@@ -362,7 +362,7 @@ class Chance:
         return np.asarray(total / self.available.sum(axis=1).reshape((-1, 1) + (1,) * (q.ndim - 2)))
 
     def shares(self, num_actions: int) -> "float | np.ndarray":
-        """The probability of each action when a uniform one is executed: 1 / A; (N, A) if sets decide it."""
+        """The probability of each action when a uniform one is executed: 1 / A, or (N, A) if sets decide it."""
         if self.available is None:
             return 1 / num_actions
         return np.asarray(self.available / self.available.sum(axis=1, keepdims=True))
@@ -374,7 +374,7 @@ class Chance:
 
         Args:
             q: (N, A), the values of executing each action.
-            previous: (N,) previously executed actions, A if there is none; it matters under sticky actions alone.
+            previous: (N,) previously executed actions, A if there is none. It matters under sticky actions alone.
             mean: (N, 1), the mean of q over actions, if it was added up already.
         """
         mean = self.mean(q) if mean is None or self.available is not None else mean
@@ -387,7 +387,7 @@ class Chance:
         return np.where(is_first, self.first_chosen * q + self.first_uniform * mean, later)
 
     def executed(self, mass: np.ndarray, policy: np.ndarray) -> np.ndarray:
-        """(N, A): the mass that executes each action; the adjoint of `choice`.
+        """(N, A): the mass that executes each action, the adjoint of `choice`.
 
         Args:
             mass: (N, W), of states, by the previously executed action if that matters.
@@ -421,7 +421,7 @@ class Chance:
 
         Args:
             policy: (N, A), the probabilities of choosing each action.
-            previous: (N,) previously executed actions, A if there is none; it matters under sticky actions alone.
+            previous: (N,) previously executed actions, A if there is none. It matters under sticky actions alone.
         """
         num_actions = policy.shape[1]
         if self.available is None:
@@ -456,10 +456,10 @@ class ChanceSetting:
             may stick: `random_actions(sticky_actions(mdp, sticky), random)`.
         lazy: probability that the action has no effect. The state stays what it is, and what the rules pay for that is
             paid, as `lazy_actions` has it.
-        reward_noise: standard deviation of noise in what is paid; 0 on average.
+        reward_noise: standard deviation of noise in what is paid, 0 on average.
         reward_delay: steps by which rewards are paid late, the last at the end.
-        scale_rewards: what is earned is divided by this number before noise and delay; or `range`, by V* - U, the value
-            of optimal less the value of uniform play.
+        scale_rewards: what is earned is divided by this number before noise and delay. `range` stands for V* - U, the
+            value of optimal less the value of uniform play.
     Raises:
         ParameterError: one of them is out of range.
     """
@@ -492,7 +492,7 @@ class ChanceSetting:
 
     @staticmethod
     def from_dict(entry: Mapping[str, float]) -> "ChanceSetting":
-        """Read `{"sticky": .., "random": ..}`; what is left out is 0.
+        """Read `{"sticky": .., "random": ..}`. What is left out is 0.
 
         Raises:
             UnknownName: another kind of chance. ParameterError: one is out of range.
@@ -517,7 +517,7 @@ class ChanceSetting:
 
     @property
     def reward_scale(self) -> float:
-        """The number by which rewards are divided; 1 if by none.
+        """The number by which rewards are divided, 1 if by none.
 
         Raises:
             ParameterError: it is `range`, which takes a task (`pharos.training.Task.scaled_chance`).
@@ -600,14 +600,14 @@ def lazy_actions(mdp: "TabularMDP", p: float, *, staying: "npt.ArrayLike | None"
 
     Its chance comes after the chance of sticky and random actions, in whatever order they are added: first it is drawn
     which action is executed, then whether it has an effect. An action without effect is the previous one of the next
-    step. Colosseum's `p_lazy`; its `p_rand` is `random_actions`.
+    step. It is Colosseum's `p_lazy`. Its `p_rand` is `random_actions`.
 
-    The mean of both rewards is exact if they are equal; elsewhere the bound of values counts its rounding.
+    The mean of both rewards is exact if they are equal. Otherwise the bound of values counts its rounding.
 
     Args:
         p: in [0, 1).
-        staying: (S, A) what staying pays. None: what the rules pay for going from s to s by a, if the MDP is of a
-            state space; else r(s, a), as the rewards of a table belong to state and action alone.
+        staying: (S, A) what staying pays. None: what the rules pay for going from s to s by a, if the MDP is of a state
+            space, else r(s, a), as the rewards of a table belong to state and action alone.
     Returns:
         An MDP without ages: a state can be visited twice.
     Raises:

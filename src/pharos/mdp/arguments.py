@@ -1,14 +1,14 @@
 """Checks of arguments, and the one rule for the sums of rows, in whatever form they were given.
 
 Each error names the argument, the value found, and the first entry that is wrong. `require_mdp` suggests what to write
-if a function gets something that an MDP can be made of; the others check the parts of a TabularMDP.
+if a function gets something that an MDP can be made of. The others check the parts of a TabularMDP.
 
 Sums of rows:
 
 | sum of a row | what happens |
 |---|---|
-| within 1e-6 of 1 | the row is divided by its sum; what that may change is counted in the error bounds of values |
-| lower | the rest ends the episode if the caller has said that rows may end; else an error |
+| within 1e-6 of 1 | the row is divided by its sum. What that may change is counted in the error bounds of values |
+| lower | the rest ends the episode if the caller has said that rows may end, else an error |
 | higher | an error |
 """
 
@@ -63,7 +63,7 @@ def _remedy(value: object) -> str:
 
 
 def array_argument(value: object, name: str, dtype: npt.DTypeLike | None = None) -> np.ndarray:
-    """The argument `name` as an array; ParameterError if it is none, such as lists of several lengths."""
+    """The argument `name` as an array. ParameterError if it is none, such as lists of several lengths."""
     try:
         return np.asarray(value, dtype)
     except (ValueError, TypeError) as error:
@@ -74,7 +74,7 @@ def checked_next_states(next_states: object) -> np.ndarray:
     """(S, A) int32 or int64: the next state of each action, -1 for the end.
 
     Raises:
-        ParameterError: it is not a table of states; the first wrong entry is named.
+        ParameterError: it is not a table of states. The first wrong entry is named.
     """
     table = array_argument(next_states, "next_states")
     if table.ndim != 2 or table.size == 0 or table.dtype.kind not in "iu":
@@ -93,7 +93,7 @@ def checked_next_states(next_states: object) -> np.ndarray:
 def whole_number(
     value: object, name: str, expected: str = "a whole number, at least 1", least: int = 1, most: float = math.inf
 ) -> int:
-    """The number; ParameterError unless it is whole, and in [least, most]."""
+    """The number. ParameterError unless it is whole, and in [least, most]."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= most:
         raise ParameterError(f"{name} is {value!r}; expected {expected}")
     return int(value)

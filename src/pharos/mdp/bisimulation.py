@@ -2,8 +2,8 @@
 
 Two states are bisimilar if they have the same actions, pay the same reward for every action and lead to bisimilar
 states. The coarsest such partition is found by refinement: start from terminal flag, rewards and, if wanted,
-observations; split classes by the classes that their states lead to, until nothing splits (Moore 1956; Kanellakis and
-Smolka 1990).
+observations. Then split classes by the classes that their states lead to, until nothing splits (Moore 1956; Kanellakis
+and Smolka 1990).
 """
 
 from dataclasses import dataclass, replace
@@ -23,7 +23,7 @@ class Minimization:
     """An MDP with bisimilar states merged.
 
     Attributes:
-        mdp: the merged MDP, with the same discount, horizon and chance; classes are numbered by their first states.
+        mdp: the merged MDP, with the same discount, horizon and chance. Classes are numbered by their first states.
         classes: (S,) int64, the class of each state.
         representatives: (C,) int64, the first state of each class.
         rounds: refinements until nothing split.
@@ -54,10 +54,10 @@ def minimize(mdp: TabularMDP, observations: npt.ArrayLike | None = None) -> Mini
         ParameterError: there is not one observation for each state.
     Exactness: exact for tables of next states. In general MDPs the probabilities of reaching a class are compared after
         rounding to 2^-40, so that the order of additions does not split classes.
-    Cost: O(S A) to find whose next states changed, in each round, and O(A) for each such state; rounds are at most the
+    Cost: O(S A) to find whose next states changed, in each round, and O(A) for each such state. Rounds are at most the
         number of steps that tell two states apart. About 40 bytes a state. Of general MDPs the rows of states that lead
         to a class with a new number, and a state gets at most log2(S): 0.4 s for 100,000 states of 4 actions and 3
-        outcomes; about 90 bytes a state and 40 an outcome.
+        outcomes. About 90 bytes a state and 40 an outcome.
     Source: Givan, Dean and Greig (2003), "Equivalence notions and model minimization in Markov decision processes";
         BRIDGE's consolidation (Laidlaw, Russell and Dragan 2023).
     """
@@ -142,6 +142,6 @@ def _quotient(mdp: TabularMDP, classes: np.ndarray, representatives: np.ndarray)
 
 def _lost() -> Rewards:
     raise ParameterError(
-        "lazy_actions: the states of this MDP stand for several, which staying may pay differently; "
-        "add lazy actions before you minimize, or say what staying= pays"
+        "cannot add lazy actions to a minimised MDP: merged states may pay differently for staying; "
+        "add lazy actions before you minimize, or pass staying="
     )

@@ -30,18 +30,18 @@ def from_arrays(
     """A deterministic MDP from arrays.
 
     Args:
-        next_states: (S, A) integers in [-1, S); -1 ends the episode after the transition's reward.
-        rewards: (S, A) finite numbers; or -inf for actions that are not available.
+        next_states: (S, A) integers in [-1, S). -1 ends the episode after the transition's reward.
+        rewards: (S, A) finite numbers, or -inf for actions that are not available.
         gamma: discount, in [0, 1].
         initial: a start state, a sequence of equally likely ones (fewer than S), or (S,) probabilities.
         horizon: number of steps of an episode, or None.
-        terminal: (S,) bool, the terminal states, whose rows must lead to themselves (or be -1) with reward 0; None:
+        terminal: (S,) bool, the terminal states, whose rows must lead to themselves (or be -1) with reward 0. None:
             the states whose whole row is -1 with reward 0.
-        available: (S, A) bool, the actions that exist in each state; None: all. What the other entries hold does not
+        available: (S, A) bool, the actions that exist in each state. None: all. What the other entries hold does not
             matter.
     Raises:
         ParameterError: a shape, an index, a reward, gamma or the start distribution is wrong, or a state that is not
-            terminal has no available action; the first such entry is named.
+            terminal has no available action. The first such entry is named.
     """
     table = checked_next_states(next_states)
     rewards = array_argument(rewards, "rewards")
@@ -73,12 +73,12 @@ def from_outcomes(
     """An MDP in which each action has up to K outcomes, from arrays.
 
     Args:
-        successors: (S, A, K) integers in [-1, S); -1 ends the episode after the transition's reward. Entries of
+        successors: (S, A, K) integers in [-1, S). -1 ends the episode after the transition's reward. Entries of
             probability 0 count for nothing.
-        probabilities: (S, A, K) of the outcomes; each row sums to 1 within 1e-6, and is divided by its sum unless
+        probabilities: (S, A, K) of the outcomes. Each row sums to 1 within 1e-6, and is divided by its sum unless
             that is 1 up to rounding.
-        rewards: (S, A) expected rewards; or (S, A, K), averaged.
-        gamma, initial, horizon, terminal, available: as in `from_arrays`; -inf only among (S, A) rewards.
+        rewards: (S, A) expected rewards, or (S, A, K), which are averaged.
+        gamma, initial, horizon, terminal, available: as in `from_arrays`. -inf only among (S, A) rewards.
     Raises:
         ParameterError: as in `from_arrays`, or a probability is not in [0, 1] or a row does not sum to 1.
     """
@@ -115,7 +115,7 @@ def from_outcome_table(
     horizon: int | None = None,
     terminal: npt.ArrayLike | None = None,
 ) -> "TabularMDP":
-    """An MDP on an existing table of outcomes, with expected rewards (S, A); see `from_outcomes`."""
+    """An MDP on an existing table of outcomes, with expected rewards (S, A), see `from_outcomes`."""
     num_states = dynamics.num_states
     reward_table = rewards_of_shape(rewards, (num_states, dynamics.num_actions))
     silent = (reward_table.array == 0).all(axis=1)
@@ -140,23 +140,21 @@ def from_matrices(
     """A general MDP from transition probabilities.
 
     Args:
-        P: a list of A matrices (S, S), dense or sparse, one an action; or an array (S, A, S) of probabilities
-            P[s, a, t]; or a sparse (S A, S) matrix with rows s A + a. A row that sums to 1 within 1e-6 is divided
-            by its sum unless that is 1 up to rounding; `residual` has what that may change, and error bounds of
-            values count it.
-        R: expected rewards (S, A); or (S,) for every action alike; or one for each transition, in any form of P,
+        P: a list of A matrices (S, S), dense or sparse, one an action. Or an array (S, A, S) of probabilities P[s, a,
+            t], or a sparse (S A, S) matrix with rows s A + a. A row that sums to 1 within 1e-6 is divided by its sum
+            unless that is 1 up to rounding. `residual` has what that may change, and error bounds of values count it.
+        R: expected rewards (S, A), or (S,) for every action alike, or one for each transition, in any form of P,
             averaged over P.
         gamma, initial, horizon: as in `from_arrays`.
         axes: of arrays with three axes, "SAS" or "ASS" (also "SAS" of a list with one (A, S) matrix a state). It
             must be given for an array with as many actions as states, which has the shape of both.
-        ends: whether a row that sums to less than 1 - 1e-6 ends the episode with the rest; or (S, A) probabilities
+        ends: whether a row that sums to less than 1 - 1e-6 ends the episode with the rest. Or (S, A) probabilities
             of ending, which are then part of the sums of rows.
-        available: (S, A) bool, the actions that exist in each state; None: all but those that R (S, A) pays -inf, and
+        available: (S, A) bool, the actions that exist in each state. None: all but those that R (S, A) pays -inf, and
             those whose row is empty (in a state in which not all rows are, and unless `ends` says what that means).
     Raises:
-        ParameterError: shapes do not fit, or a probability or reward is out of range; or a row does not sum to 1:
-            the message names the first one, and the likely reason; or a state that is not terminal has no available
-            action.
+        ParameterError: shapes do not fit, a probability or reward is out of range, or a state that is not terminal has
+            no available action. Or a row does not sum to 1: the message names the first one, and the likely reason.
     """
     matrix, num_actions, residuals, sets = transitions_of(P, axes, ends, available, R)
     dynamics = Matrices(matrix, num_actions)

@@ -1,13 +1,13 @@
 """Transition dynamics of executed actions, independent of how transitions are stored.
 
 `Dynamics` has the operations of mathematics: expectations, their adjoint, possible successors. It knows no chance of
-choosing, no policy and no terminal states; a `BellmanEquation` supplies them for a whole backup.
+choosing, no policy and no terminal states. A `BellmanEquation` supplies them for a whole backup.
 
 A way of storing transitions is one class: `Table` (table.py), `OutcomeTable` (also there). It needs the methods
 that are abstract here, four attributes, and arrays that kernels/outcomes.py can read: all loops are compiled, each
 written once for all of them. See docs/decisions/0008-one-operator.md for the reasons, and the place of a new class.
 
-States are numbered 0 .. S - 1; S stands for the end of an episode, which has no value and no successors.
+States are numbered 0 .. S - 1. S stands for the end of an episode, which has no value and no successors.
 
 Runs: some rows of a range, as a few contiguous stretches of it.
 """
@@ -40,7 +40,7 @@ class BellmanEquation(NamedTuple):
         (T x)(s, b) = chance of choice in q(s, .),   q(s, a) = r(s, a) + gamma E x(next, a)
 
     x is (S + 1, W) float64: V(s, b) by the previously executed action b under sticky actions (W = A), else V(s) (W =
-    1); row S, the end, is 0.
+    1). Row S, the end, is 0.
     """
 
     rewards: Rewards
@@ -79,7 +79,7 @@ class TopologicalOrder(NamedTuple):
     """An order of states in which each comes before those that it may lead to.
 
     Attributes:
-        states: (S,) all of them; None if they are in the order of their numbers.
+        states: (S,) all of them, or None if they are in the order of their numbers.
         longest: the steps of the longest way through them, or more.
     """
 
@@ -113,7 +113,7 @@ class Dynamics(ABC):
         is_deterministic: whether executing an action has one outcome, everywhere.
         has_ends: whether some execution ends the episode without a next state.
         laziness: probability that nothing happens, as far as `lazy` has added it.
-        workers: threads of a backup, if it has several; None for all processors.
+        workers: threads of a backup, if it has several. None for all processors.
         is_of_many: whether these are some states of an MDP with so many that its sweeps are unrolled.
     """
 
@@ -134,7 +134,7 @@ class Dynamics(ABC):
         """(N, A, ...): E x(next) of executing each action in some states (indices or a slice).
 
         Args:
-            x: (S + 1,), a value for each state, row S for the end; or (S + 1, W, ...), W = A by the action that led
+            x: (S + 1,), a value for each state, row S for the end. Or (S + 1, W, ...), W = A by the action that led
                 there, or 1.
         """
 
@@ -183,7 +183,7 @@ class Dynamics(ABC):
         """The dynamics of the states [start, stop), numbered as in `Part`, and the outside states they may lead to."""
 
     def deterministic_table(self) -> Indices | None:
-        """(S, A) next states, -1 for the end, if each execution has one outcome; else None."""
+        """(S, A) next states, -1 for the end, if each execution has one outcome, else None."""
         return None
 
     @property
@@ -194,7 +194,7 @@ class Dynamics(ABC):
     # Derived operations -----------------------------------------------------------------------------------------------
 
     def restricted_to(self, states: np.ndarray) -> "Dynamics":
-        """The dynamics of these states alone, ascending and renumbered; transitions that leave them are replaced.
+        """The dynamics of these states alone, ascending and renumbered. Transitions that leave them are replaced.
 
         Their sweeps are compiled as sweeps of all states are: who asks for many such parts has a large MDP.
         """
@@ -205,7 +205,7 @@ class Dynamics(ABC):
     def backup(self, equation: BellmanEquation, x: np.ndarray, out: np.ndarray, runs: np.ndarray | None = None) -> None:
         """Set out to T x, out not x itself. Between the rows of the states and the end there may be the rows of a halo.
 
-        runs: the states of some runs (R, 2) alone, see `runs_of`; None: all.
+        runs: the states of some runs (R, 2) alone, see `runs_of`. None: all.
         """
         rewards, gamma, chance, select = equation
         choice = _choice(select)
@@ -232,10 +232,10 @@ class Dynamics(ABC):
     def sweep(
         self, equation: BellmanEquation, x: np.ndarray, threads: int = 1, part: tuple[int, int] | None = None
     ) -> float:
-        """Replace each entry of x by its backup, from entries that are old or already new; once each.
+        """Replace each entry of x by its backup, from entries that are old or already new, once each.
 
         Args:
-            threads: that may share the entries; their order is then left to chance, so that x is not the same to the
+            threads: that may share the entries. Their order is then left to chance, so that x is not the same to the
                 last bit in every run.
             part: the states [start, stop) alone.
         Returns the largest change.
@@ -254,7 +254,7 @@ class Dynamics(ABC):
         return occupancy.push(self.for_kernels, step.live, step.policy, step.chance.for_kernels, now, after)
 
     def push_forward(self, mass: np.ndarray, width: int = 1) -> np.ndarray:
-        """(S, W): the mass (S, A) of executed actions one step later, without what ends; W = A by that action, or 1.
+        """(S, W): the mass (S, A) of executed actions one step later, without what ends. W = A by that action, or 1.
 
         The adjoint of `expected`: sum(mass * expected(x)) = sum(push_forward(mass) * x) if x is 0 at the end.
         """
@@ -265,7 +265,7 @@ class Dynamics(ABC):
     def accumulate_visits(
         self, step: PolicyStep, gamma: float, least: float, waiting: np.ndarray, visits: np.ndarray
     ) -> float:
-        """Add the waiting mass (S, W) to visits (S, W) and move it on, discounted; return the mass that waits then.
+        """Add the waiting mass (S, W) to visits (S, W) and move it on, discounted. Return the mass that waits then.
 
         Masses below `least` may stay.
         """
@@ -277,7 +277,7 @@ class Dynamics(ABC):
         occupancy.support(self.for_kernels, step.live, step.policy, step.chance.for_kernels, reachable)
 
     def entries_of(self, states: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """`entries` of each action in each of some states; the first is i A + a."""
+        """`entries` of each action in each of some states. The first is i A + a."""
         return self.entries(*self._all_actions(states))
 
     def outcomes(self, states: np.ndarray, actions: np.ndarray) -> Outcomes:
@@ -294,7 +294,7 @@ class Dynamics(ABC):
         return Outcomes(which, matrix.indices.astype(np.int64), matrix.data)
 
     def successors_of(self, states: np.ndarray) -> np.ndarray:
-        """The states that some action may lead to from some of these, ascending; S stands for the end."""
+        """The states that some action may lead to from some of these, ascending. S stands for the end."""
         next_states = self.entries_of(states)[1]
         return np.unique(np.where(next_states < 0, self.num_states, next_states))
 
@@ -396,7 +396,8 @@ class Dynamics(ABC):
                     break
 
     def order(self, live: np.ndarray) -> TopologicalOrder | None:
-        """An order of states in which each live one (S,) bool stands before those it leads to; None: there is none."""
+        """An order of states in which each live one (S,) bool stands before those it leads to, or None if there is
+        none."""
         states = None
         if bellman.is_increasing(self.for_kernels, live, None)[0] >= 0:
             states = bellman.topological_order(self.for_kernels, live)
@@ -445,11 +446,11 @@ def swept(
     threads: int = 1,
     part: tuple[int, int] | None = None,
 ) -> float:
-    """Replace each entry of x by its backup, from the last state of an order to the first; the largest change.
+    """Replace each entry of x by its backup, from the last state of an order to the first. Return the largest change.
 
     Args:
         threads: each has a part of the states, if that is possible.
-        part: the range [start, stop) of the order that are swept; None: all.
+        part: the range [start, stop) of the order that are swept. None: all.
     """
     rewards, gamma, chance, select = equation
     others = (*rewards.for_kernels, gamma)
@@ -485,7 +486,7 @@ def swept(
 
 
 def _choice(select: Selection) -> "float | np.ndarray | None":
-    """The argument `choice` of kernels; None for policies that are random, or depend on the previous action."""
+    """The argument `choice` of kernels, or None for policies that are random, or depend on the previous action."""
     if isinstance(select, Extreme):
         return select.sign
     assert isinstance(select, PolicyTable)
@@ -511,7 +512,7 @@ def as_indices(table: np.ndarray, num_states: int) -> np.ndarray:
 
 
 def part_with_halo(blocks: Blocks, shape: tuple[int, ...], start: int, stop: int) -> tuple[Indices, np.ndarray]:
-    """(next states of a range renumbered for its part, int32 if that is enough; its halo).
+    """(next states of a range renumbered for its part, int32 if that is enough, its halo).
 
     Args:
         blocks: () -> (first row, some rows) of the next states of the states [start, stop), from the first row on;
@@ -535,7 +536,7 @@ def part_with_halo(blocks: Blocks, shape: tuple[int, ...], start: int, stop: int
 
 
 def runs_of(is_in: np.ndarray, gap: int = 1) -> np.ndarray:
-    """(R, 2) int64: first row and end of each stretch of rows of which is_in (n,) bool holds; ascending.
+    """(R, 2) int64: first row and end of each stretch of rows of which is_in (n,) bool holds, ascending.
 
     gap: stretches with fewer rows than that between them are one.
     """
@@ -557,7 +558,7 @@ def count_of(runs: np.ndarray) -> int:
 
 
 def shares_of(runs: np.ndarray, shares: int) -> list[np.ndarray]:
-    """The runs (R, 2) cut into `shares` parts of equal numbers of rows, up to one; in order, without empty parts."""
+    """The runs (R, 2) cut into `shares` parts of equal numbers of rows, up to one, in order, without empty parts."""
     before = np.concatenate([[0], np.cumsum(runs[:, 1] - runs[:, 0])])
     cuts = [int(before[-1]) * i // shares for i in range(shares + 1)]
     parts = []

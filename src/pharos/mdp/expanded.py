@@ -1,7 +1,7 @@
 """An MDP with chance, written out: nodes, choices and their outcomes.
 
 Nodes. Without sticky actions the states, and the implicit end. Under sticky actions the pairs (state, previously
-executed action) that can be reached, and the start states without a previous action; a target is a state, reached with
+executed action) that can be reached, and the start states without a previous action. A target is a state, reached with
 any previous action.
 """
 
@@ -22,8 +22,8 @@ class ExpandedMDP:
 
     Attributes:
         matrix: (N A, N) CSR, probabilities.
-        underlying: (N,) the state of each node; S for the implicit end.
-        previous: (N,) the previously executed action, A for none; -1 if it does not matter.
+        underlying: (N,) the state of each node, S for the implicit end.
+        previous: (N,) the previously executed action, A for none, -1 if it does not matter.
         starts: [(node, probability)] of the first step.
         num_actions: A.
         is_restart: (N,) bool, nodes in which episodes end, if a restart leads to one of several start states: all of
@@ -40,7 +40,7 @@ class ExpandedMDP:
 
     @cached_property
     def table(self) -> np.ndarray | None:
-        """(N, A), the only node that each choice leads to; None if some choice has several outcomes."""
+        """(N, A), the only node that each choice leads to, or None if some choice has several outcomes."""
         matrix = self.matrix
         is_single = matrix.nnz == matrix.shape[0] and (np.diff(matrix.indptr) == 1).all() and (matrix.data == 1.0).all()
         return matrix.indices.reshape(-1, self.num_actions).astype(np.int64) if is_single else None
@@ -82,7 +82,7 @@ class ExpandedMDP:
 
     @cached_property
     def _recurrent_class(self) -> np.ndarray:
-        """(N,) the recurrent class of each node, from 0 on, of nodes that lead to each other alone; -1: none."""
+        """(N,) the recurrent class of each node, from 0 on, of nodes that lead to each other alone, -1 for none."""
         first, previous = self.reversed
         size = len(self.underlying)
         graph = scipy.sparse.csr_matrix((np.ones(len(previous), np.int8), previous, first), shape=(size, size))
@@ -108,7 +108,7 @@ class ExpandedMDP:
         """Proven, far too large upper bound on the expected time of any target: H / q^H.
 
         A shortest path of at most H edges, each of probability q or more, succeeds with probability q^H or more. H is
-        the length of paths by way of one node, to which all others lead; infinite if there is none.
+        the length of paths by way of one node, to which all others lead. Infinite if there is none.
         """
         if not self.is_connected or self._recurrent_class.max() > 0:
             return math.inf
@@ -130,7 +130,7 @@ class ExpandedMDP:
 
     @staticmethod
     def of(mdp: TabularMDP, restart: bool) -> "ExpandedMDP":
-        """The MDP written out; restart: an action in a terminal state leads back to the start."""
+        """The MDP written out. restart: an action in a terminal state leads back to the start."""
         num_states, num_actions = mdp.num_states, mdp.num_actions
         width = mdp.policy_width  # node s (A + 1) + b, b = A: no previous action
         terminal = np.asarray(mdp.terminal)
@@ -232,7 +232,8 @@ def nodes_of_outcomes(outcomes: "scipy.sparse.csr_matrix", num_actions: int, wid
 
 
 def outcome_matrix(mdp: TabularMDP, terminal: np.ndarray) -> "tuple[scipy.sparse.csr_matrix, bool]":
-    """(S A, S + 1 or S) outcomes of executing actions, rows of terminal states empty; whether the end is among them."""
+    """(S A, S + 1 or S) outcomes of executing actions, rows of terminal states empty. Also whether the end is among
+    them."""
     matrix = mdp.dynamics.matrix(~terminal)
     ends = bool((matrix.indices == mdp.num_states).any())
     if not ends:

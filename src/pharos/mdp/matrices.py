@@ -100,7 +100,7 @@ def likely_reason(matrix: "csr_matrix", num_actions: int, row: int, total: float
 
 
 def is_list_of_matrices(value: object) -> "TypeGuard[list[np.ndarray]]":
-    """Whether it is a list or tuple of matrices, dense or sparse; nested lists of numbers are an array."""
+    """Whether it is a list or tuple of matrices, dense or sparse. Nested lists of numbers are an array."""
     return isinstance(value, list | tuple) and bool(value) and all(getattr(each, "ndim", 0) == 2 for each in value)
 
 
@@ -162,7 +162,7 @@ def expected_rewards(
     residuals: np.ndarray,
     sets: np.ndarray | None = None,
 ) -> tuple[Rewards | np.ndarray, Residual]:
-    """((S, A) expected rewards, residual), from (S, A); from (S,), alike for every action; or from a reward for each
+    """((S, A) expected rewards, residual), from (S, A), from (S,), alike for every action, or from a reward for each
     transition, in any form of P, averaged over the probabilities.
 
     Other shapes are returned unchanged.

@@ -3,7 +3,8 @@
 The expressions follow PRISM's language without functions: comparisons of sums and products of whole numbers and
 variables, joined by & | ! and parentheses. They are parsed, never executed.
 
-Source: Kwiatkowska, Norman and Parker (2011), "PRISM 4.0"; its manual, section "Expressions", for what binds stronger.
+Source: Kwiatkowska, Norman and Parker (2011), "PRISM 4.0", and its manual, section "Expressions", for what binds
+stronger.
 """
 
 import re
@@ -28,8 +29,8 @@ class Names:
     Attributes:
         labels: name -> (S,) bool, the states that have the label.
         variables: name -> (S,) integers or bool, the value of a variable in each state.
-        actions: (A,) names of the actions, if they have the same one in each state; None: they are numbers.
-        choices: (S, A) positions in `choice_names`, if names of actions differ between states; -1: see actions.
+        actions: (A,) names of the actions, if they have the same one in each state. None: they are numbers.
+        choices: (S, A) positions in `choice_names`, if names of actions differ between states. -1: see actions.
     """
 
     labels: Mapping[str, np.ndarray] = field(default_factory=dict)
@@ -54,13 +55,13 @@ class Names:
         )
 
     def action(self, state: int, action: int) -> str:
-        """Name of an action in a state; its number if it has none."""
+        """Name of an action in a state, or its number if it has none."""
         if self.choices is not None and (code := int(self.choices[state, action])) >= 0:
             return self.choice_names[code]
         return str(action) if self.actions is None else self.actions[action]
 
     def state(self, state: int) -> str:
-        """The values of the variables, such as "x=3 y=0 done=true"; "" if there are none."""
+        """The values of the variables, such as "x=3 y=0 done=true", or "" if there are none."""
         return " ".join(f"{name}={_written(column[state])}" for name, column in self.variables.items())
 
     def labels_of(self, state: int) -> list[str]:
@@ -75,7 +76,7 @@ class Names:
         ! binds weaker than comparisons: !x=3 is !(x=3).
 
         Raises:
-            ParameterError: it is none. UnknownName: it names something else; the message lists what there is.
+            ParameterError: it is none. UnknownName: it names something else. The message lists what there is.
         """
         if expression in self.labels:
             return np.array(self.labels[expression], np.bool_)
@@ -92,7 +93,7 @@ class Names:
 
 
 def names_of(mdp: "TabularMDP") -> Names:
-    """The names that an MDP came with; else the variables and actions of the state space that it is of."""
+    """The names that an MDP came with, else the variables and actions of the state space that it is of."""
     if mdp.names is not None:
         return mdp.names
     if mdp.space is None:
@@ -107,7 +108,7 @@ def names_from(
     actions: Sequence[str] | None,
     shape: tuple[int, int],
 ) -> Names:
-    """Names from what a user gives; ParameterError if they do not fit (S, A) states and actions."""
+    """Names from what a user gives. ParameterError if they do not fit (S, A) states and actions."""
     num_states, num_actions = shape
     masks = {name: _label_mask(name, each, num_states) for name, each in labels.items()}
     columns = {name: np.asarray(each) for name, each in variables.items()}
@@ -208,7 +209,7 @@ class Parser:
         self.tokens = self._tokens()
 
     def truth(self) -> np.ndarray:
-        """(S,) or () bool; ParameterError if the text is no expression."""
+        """(S,) or () bool. ParameterError if the text is no expression."""
         result = self._either()
         if self.index < len(self.tokens):
             raise self._error(f"{self._shown()} after {capped(result.text, 60)!r}", "& or | between two conditions")
@@ -310,7 +311,7 @@ class Parser:
     # Kinds ----------------------------------------------------------------------------------------------------------
 
     def _truth(self, term: Term) -> np.ndarray:
-        """The truth of a term; a variable that is only 0 or 1 is true if it is 1."""
+        """The truth of a term. A variable that is only 0 or 1 is true if it is 1."""
         if not term.is_number:
             return term.values
         if term.values.ndim and term.size <= 1 and term.values.min(initial=0) >= 0:

@@ -86,7 +86,7 @@ def mdp_within(mdp: TabularMDP, steps: int) -> TabularMDP:
     Transitions of states that take all the steps to reach may be wrong: those that leave the set are replaced.
 
     Returns:
-        This MDP if all of its states are reached; else one without a folder, as its states have other numbers.
+        This MDP if all of its states are reached, else one without a folder, as its states have other numbers.
     Cost: one read of each transition of the reached states, and a copy of them.
     """
     is_reached = states_within(mdp, steps)
@@ -97,7 +97,7 @@ def mdp_within(mdp: TabularMDP, steps: int) -> TabularMDP:
 
 
 def restricted_to(mdp: TabularMDP, states: np.ndarray) -> TabularMDP:
-    """The MDP of some states, ascending, the start states among them; they are numbered anew."""
+    """The MDP of some states, ascending, the start states among them. They are numbered anew."""
     number = np.full(mdp.num_states, -1, np.int64)
     number[states] = np.arange(len(states))
     return replace(
@@ -131,7 +131,7 @@ class Part:
     sweep together (solvers/ranked.py).
 
     Inside a part its own states have the numbers 0 .. n - 1, in order, and states of the halo n .. n + H - 1,
-    ascending; -1 is the end. Arrays of values have n + H + 1 rows, so the compiled sweeps run over parts as they are.
+    ascending. -1 is the end. Arrays of values have n + H + 1 rows, so the compiled sweeps run over parts as they are.
 
     Attributes:
         halo: (H,) int64, ascending: the states outside that these may lead to.
@@ -189,7 +189,7 @@ class EndComponents(NamedTuple):
 
     Attributes:
         labels: (S,) integers, under sticky actions (S, A) by the previously executed action: the number of the
-            component that a node is in, from 0 on; -1: in none.
+            component that a node is in, from 0 on, -1 for none.
         pairs: (S, A) bool, under sticky actions (S, A, A): the choices that stay in the component, whatever happens.
         total: how many components there are.
     """
@@ -209,8 +209,8 @@ def end_components(mdp: TabularMDP, pairs: np.ndarray | None = None) -> EndCompo
 
     Args:
         pairs: (S, A) bool, under sticky actions also (S, A, A) with the previously executed action second: the choices
-            that may be made; None: all.
-    Cost: a few reads of all transitions, of which only the transitions of nodes in question are looked at again; A + 33
+            that may be made. None: all.
+    Cost: a few reads of all transitions, of which only the transitions of nodes in question are looked at again. A + 33
         bytes a node. Source: de Alfaro (1997), section 3.3.
     """
     width, num_actions = mdp.width, mdp.num_actions

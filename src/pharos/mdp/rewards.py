@@ -1,7 +1,7 @@
 """Rewards of all transitions, held exactly and compactly.
 
 Games pay few different rewards: up to 256 distinct values are kept as one byte for each transition and a palette of
-float64, an eighth of the memory of (S, A) float64 and an eighth of what a sweep has to stream; more are kept as
+float64, an eighth of the memory of (S, A) float64 and an eighth of what a sweep has to stream. More are kept as
 float64.
 
 Rewards of stored transitions are computed in parallel after the build, and replaced without building again.
@@ -55,7 +55,7 @@ class Rewards:
 
     @staticmethod
     def from_array(rewards: np.ndarray, rounding: float = 0.0) -> "Rewards":
-        """Make rewards of (S, A) numbers; ParameterError if one is NaN or infinite."""
+        """Make rewards of (S, A) numbers. ParameterError if one is NaN or infinite."""
         rewards = np.asarray(rewards, np.float64)
         collector = RewardsCollector((rewards.shape[0], rewards.shape[1]))
         for start in range(0, len(rewards), _REWARD_BLOCK):
@@ -80,14 +80,14 @@ class Rewards:
 
     @cached_property
     def for_kernels(self) -> tuple[np.ndarray, np.ndarray]:
-        """(table, palette), the arguments of kernels; the rewards of few states are float64, one type for all."""
+        """(table, palette), the arguments of kernels. The rewards of few states are float64, one type for all."""
         if self.is_unrolled:
             return read_only(self.table), read_only(self.palette)
         return read_only(np.ascontiguousarray(self.array)), read_only(np.empty(0))
 
     @property
     def array(self) -> np.ndarray:
-        """(S, A) float64; made anew by each call if the rewards are kept as a palette."""
+        """(S, A) float64, made anew by each call if the rewards are kept as a palette."""
         return self.rows(slice(None))
 
     def rows(self, states: slice | np.ndarray) -> np.ndarray:
@@ -116,7 +116,7 @@ class Rewards:
 
     @cached_property
     def unit(self) -> float:
-        """The largest power of two, 1 at most, of which all rewards are whole multiples; 0 if they are rounded, or
+        """The largest power of two, 1 at most, of which all rewards are whole multiples. 0 if they are rounded, or
         more than a palette has."""
         if not len(self.palette) or self.rounding:
             return 0.0
@@ -137,7 +137,7 @@ class RangedRewards(Rewards):
     """Rewards of a state space that are computed when they are read, of a range of states or of all.
 
     Attributes:
-        whole: the rewards of all states, once they were computed; else None.
+        whole: the rewards of all states, once they were computed, else None.
     """
 
     def __init__(self, shape: tuple[int, int], compute: Callable[[int, int], Rewards]):
@@ -171,7 +171,7 @@ class RangedRewards(Rewards):
 
 @dataclass
 class RewardsCollector:
-    """Collector of rewards, block by block; they end with a palette if few are distinct."""
+    """Collector of rewards, block by block. They end with a palette if few are distinct."""
 
     shape: tuple[int, int]
     _codes: np.ndarray | None = None
@@ -198,7 +198,7 @@ class RewardsCollector:
         self._values[start : start + len(block)] = block
 
     def _is_known(self, start: int, block: np.ndarray) -> bool:
-        """Enter a block whose rewards are all among the first few of the palette; return whether they are."""
+        """Enter a block whose rewards are all among the first few of the palette. Return whether they are."""
         assert self._codes is not None
         codes, left = np.zeros(block.shape, np.uint8), block.size
         for code, reward in enumerate(self._palette[:_FEW_ENTRIES]):
@@ -233,7 +233,7 @@ def rounding_of_mean(outcomes: int, largest: float) -> float:
 
 
 def rewards_of_shape(rewards: npt.ArrayLike | Rewards, shape: tuple[int, ...]) -> Rewards:
-    """Rewards of an array, or those that were made; ParameterError if their shape is not `shape`, or not finite."""
+    """Rewards of an array, or those that were made. ParameterError if their shape is not `shape`, or not finite."""
     array = rewards.array if isinstance(rewards, Rewards) else array_argument(rewards, "rewards", np.float64)
     if array.shape != shape:
         raise ParameterError(f"rewards have shape {array.shape}; expected {shape}, one for each state and action")
@@ -243,7 +243,7 @@ def rewards_of_shape(rewards: npt.ArrayLike | Rewards, shape: tuple[int, ...]) -
 def expected_over_outcomes(
     rewards: npt.ArrayLike, probabilities: np.ndarray
 ) -> tuple[Rewards | np.ndarray, np.ndarray | float]:
-    """((S, A) expected rewards, the largest that an outcome pays): as given, and 0; or means of rewards (S, A, K).
+    """((S, A) expected rewards, the largest that an outcome pays): as given, and 0, or means of rewards (S, A, K).
 
     Raises:
         ParameterError: they have neither shape, or one of a possible outcome is not finite.
@@ -289,7 +289,7 @@ def rewards_of_space(
     Args:
         rewards: None, an (S, A) array, or a function reward(self, state, action, next_state) -> float, or with the
             outcome as one more argument.
-        workers: threads; the result does not depend on them.
+        workers: threads. The result does not depend on them.
     Raises:
         ParameterError: the array has the wrong shape, or holds NaN or infinity.
         RuleError: the reward function gave NaN or infinity for a transition, which the message names.
@@ -323,7 +323,7 @@ def ranged_rewards(space: "StateSpace") -> "Rewards":
 
 
 def rewards_of_staying(space: "StateSpace", reward: Callable | None = None) -> "Rewards":
-    """(S, A) rewards by the rules for going from a state to itself, possible or not; 0 in terminal states.
+    """(S, A) rewards by the rules for going from a state to itself, possible or not, 0 in terminal states.
 
     Args:
         reward: a function reward(self, state, action, next_state) in place of the environment's.
@@ -359,7 +359,7 @@ def _rewards_of_blocks(
     first: int = 0,
     last: int | None = None,
 ) -> "Rewards":
-    """Rewards of the states [first, last), from blocks; RuleError if one is not finite."""
+    """Rewards of the states [first, last), from blocks. RuleError if one is not finite."""
     from pharos.rules import refused_reward
 
     stop = space.num_states if last is None else last
@@ -419,7 +419,7 @@ def paid_outcomes(mdp: "TabularMDP") -> PaidOutcomes:
     """The possible outcomes of all states and executed actions of an MDP, each with its own reward.
 
     A reward is the outcome's own if the MDP is of an environment whose rewards it has, else the expected one of
-    state and action. Cost: some 50 bytes an outcome; for MDPs that fit.
+    state and action. Cost: some 50 bytes an outcome, for MDPs that fit.
     """
     num_states, num_actions = mdp.num_states, mdp.num_actions
     expected = np.ravel(mdp.rewards)
@@ -443,7 +443,7 @@ def paid_outcomes(mdp: "TabularMDP") -> PaidOutcomes:
 
 
 def _outcomes_of_environment(mdp: "TabularMDP") -> PaidOutcomes | None:
-    """Outcomes with rewards by the rules, if the MDP has chance and is of an environment; else None."""
+    """Outcomes with rewards by the rules, if the MDP has chance and is of an environment, else None."""
     space = mdp.space
     if space is None or space.environment is None or mdp.dynamics.is_deterministic:
         return None

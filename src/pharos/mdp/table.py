@@ -1,7 +1,7 @@
 """Tables of transitions.
 
 `Table`: one next state for each state and action, of deterministic games. `Lazy`: another table in which actions have
-no effect with some probability; neither successors nor probabilities are copied. `OutcomeTable`: several outcomes for
+no effect with some probability. Neither successors nor probabilities are copied. `OutcomeTable`: several outcomes for
 each state and action, of games whose rules have chance.
 
 Arrays of outcomes as users write them are checked, and held compactly. A sparse matrix of transitions becomes such a
@@ -21,6 +21,7 @@ from pharos.mdp.actions import States
 from pharos.mdp.arguments import ROUNDED, array_argument, normalized_rows, rounding_hint
 from pharos.mdp.dynamics import Dynamics, Outcomes, TopologicalOrder, as_indices, part_with_halo
 from pharos.system.arrays import (
+    UNIT_ROUNDOFF,
     Indices,
     OutcomeCheck,
     OutcomeRows,
@@ -41,7 +42,7 @@ class Table(Dynamics):
     """One next state for each state and action, as a table.
 
     Attributes:
-        next_states: (S, A) int32, int64 or `PackedIndices`; -1: the episode ends there.
+        next_states: (S, A) int32, int64 or `PackedIndices`. -1: the episode ends there.
     """
 
     operations, mass, is_deterministic = 0, 1.0, True
@@ -113,9 +114,6 @@ class Table(Dynamics):
 # Lazy -----------------------------------------------------------------------------------------------------------------
 
 
-_UNIT = 2.0**-53
-
-
 class Lazy(Dynamics):
     """Tables of next states or of outcomes, and a probability that a state stays what it is.
 
@@ -124,7 +122,7 @@ class Lazy(Dynamics):
     Under sticky actions the action that had no effect counts as executed.
 
     Attributes:
-        tables: the dynamics without laziness; if they are lazy already, their own tables, and p is the probability of
+        tables: the dynamics without laziness. If they are lazy already, their own tables, and p is the probability of
             both.
         laziness: p, in (0, 1).
         roundings: of p and of the mean. Joining two p is off by at most 4 units, which move as much weight from one
@@ -143,7 +141,7 @@ class Lazy(Dynamics):
         self.num_states, self.num_actions = tables.num_states, tables.num_actions
         self.operations = tables.operations + roundings
         # of the products with 1 - p, and of 1 - p
-        self.mass = max(1.0, tables.mass) * (1 + (self.operations + 2) * _UNIT)
+        self.mass = max(1.0, tables.mass) * (1 + (self.operations + 2) * UNIT_ROUNDOFF)
 
     @property
     def for_kernels(self) -> object:
@@ -215,7 +213,7 @@ class Lazy(Dynamics):
 # The share of a dense table that may be padding before successors are kept one row after another.
 MOST_PADDING = 0.3
 # Vectors of probabilities that codes of one and of two bytes tell apart.
-ONE_BYTE_CODES, MOST_CODES = 1 << 8, 1 << 16
+ONE_BYTE_CODES, TWO_BYTE_CODES = 1 << 8, 1 << 16
 
 
 def checked_outcomes(
@@ -224,7 +222,7 @@ def checked_outcomes(
     """(successors, probabilities as float64, |sum - 1| (S, A) of the rows divided by it), the first two (S, A, K).
 
     Raises:
-        ParameterError: a shape or type is wrong, an index is outside, or a row holds no probabilities; the first such
+        ParameterError: a shape or type is wrong, an index is outside, or a row holds no probabilities. The first such
             entry is named.
     """
     table, chances = array_argument(successors, "successors"), array_argument(probabilities, "probabilities")
@@ -269,7 +267,7 @@ def compact_outcomes(
     probabilities: np.ndarray,
     *,
     most_padding: float = MOST_PADDING,
-    most_vectors: int = MOST_CODES,
+    most_vectors: int = TWO_BYTE_CODES,
 ) -> dict[str, Any]:
     """Arguments of an `OutcomeTable`, from (S, A, K) arrays: the possible outcomes alone, in their order."""
     num_states, num_actions, _ = successors.shape
@@ -323,7 +321,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
     """Several next states for each state and action, and their probabilities, as the tables of `OutcomeRows`."""
 
     def __init__(self, successors: Indices, num_actions: int, **others: Indices | None):
-        """others: offsets, codes, palette, probabilities; see `OutcomeRows`, which also raises."""
+        """others: offsets, codes, palette, probabilities, see `OutcomeRows`, which also raises."""
         super().__init__(successors, **others)
         self.num_actions = num_actions
         rows = len(successors) * num_actions if self.offsets is None else len(self.offsets) - 1
@@ -337,7 +335,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
         30 % of (S, A, K) would be padding.
 
         Raises:
-            ParameterError: a shape, an index or a probability is wrong, or a row does not sum to 1 within 1e-6; the
+            ParameterError: a shape, an index or a probability is wrong, or a row does not sum to 1 within 1e-6. The
                 first such entry is named. Rows within that are divided by their sums.
         """
         return OutcomeTable(**compact_outcomes(*checked_outcomes(successors, probabilities)[:2]))
@@ -409,7 +407,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
             beyond = max(math.fsum([*vector, -1.0]) for vector in np.asarray(self.palette).tolist())
             return 1.0 if beyond <= 0 else math.nextafter(1.0 + beyond, 2.0)
         sums = self.expected(np.ones(self.num_states + 1))
-        return max(1.0, float(sums.max()) * (1 + self.num_outcomes * _UNIT))
+        return max(1.0, float(sums.max()) * (1 + self.num_outcomes * UNIT_ROUNDOFF))
 
     @cached_property
     def has_ends(self) -> bool:  # type: ignore[override]
@@ -475,7 +473,7 @@ class OutcomeTable(OutcomeRows, Dynamics):
         return self._renumbered(representatives, np.append(classes, -1))
 
     def ends_and_stays(self) -> tuple[np.ndarray, np.ndarray]:
-        """(S,) bool each: whether a state leads to nothing but the end; and to nothing but the end or itself."""
+        """(S,) bool each: whether a state leads to nothing but the end, and to nothing but the end or itself."""
         successors, states = np.asarray(self.flat), np.arange(self.num_states + 1)
         first = self.begins(states * self.num_actions)
         ends = successors == -1
@@ -485,14 +483,14 @@ class OutcomeTable(OutcomeRows, Dynamics):
     # Parts of it ------------------------------------------------------------------------------------------------------
 
     def _renumbered(self, states: np.ndarray, number: np.ndarray) -> "OutcomeTable":
-        """The rows of some states; number (S + 1,) of each next state, -1 for the end, -2 for the state of the row."""
+        """The rows of some states. number: (S + 1,) of each next state, -1 for the end, -2 for the state of the row."""
         which, entries = self.entry_indices(self._rows(np.asarray(states)))
         next_states = number[self.flat[entries]]
         next_states = np.where(next_states == -2, which // self.num_actions, next_states)
         return self._of_states(states, entries, as_indices(next_states, len(states)))
 
     def _of_states(self, states: States, entries: States, successors: Indices) -> "OutcomeTable":
-        """Rows of some states, with other successors (N,); entries (N,): indices of all their outcomes, in order."""
+        """Rows of some states, with other successors (N,). entries: (N,) indices of all their outcomes, in order."""
         arrays: dict[str, Any] = {"successors": successors.reshape(-1, *self.successors.shape[1:])}
         if self.offsets is not None:
             rows = self._rows(np.arange(self.num_states)[states])
@@ -513,7 +511,7 @@ class Matrices(OutcomeTable):
     """A table of outcomes, row after row, that was given as a sparse matrix, and is stored in files as one.
 
     Attributes:
-        transitions: (S A, S) CSR float64, row s A + a; 1 minus the sum of a row is the probability that the episode
+        transitions: (S A, S) CSR float64, row s A + a. 1 minus the sum of a row is the probability that the episode
             ends, if it exceeds 4 (n + 2) units of 2^-53 for rows of n entries: less may be rounding.
     """
 

@@ -39,29 +39,29 @@ if TYPE_CHECKING:
 class TabularMDP:
     """A Markov decision process of S states and A actions.
 
-    Made by `StateSpace.mdp`, `from_arrays`, `from_outcomes` or `from_matrices`; `sticky_actions`, `random_actions` and
+    Made by `StateSpace.mdp`, `from_arrays`, `from_outcomes` or `from_matrices`. `sticky_actions`, `random_actions` and
     `lazy_actions` add chance.
 
     Attributes:
         dynamics: transitions of executed actions, the same interface for every way of storing them.
-        reward_table: the rewards, compactly; `rewards` is the same as (S, A) float64.
+        reward_table: the rewards, compactly. `rewards` is the same as (S, A) float64.
         terminal: (S,) bool, the terminal states: they lead to themselves with reward 0 (or are whole rows of -1, reward
             0).
         gamma: discount, in [0, 1].
         horizon: number of steps T after which an episode ends, or None.
         start_states, start_probabilities: the start distribution.
         chance: weights of the chosen, the previously executed and a uniform action.
-        folder: of the state space, or of an imported table; None: in no folder.
+        folder: of the state space, or of an imported table. None: in no folder.
         space: the state space that the states are of, if there is one.
-        is_numbered: whether states have the numbers that they were given with; not after some were merged.
-        age: (S,) integers that each transition out of a state that is not terminal makes larger; None if they are
-            not known. Solvers take the states in this order then, once.
-        available: (S, A) bool, the actions that exist in each state, one or more, all in terminal states; None: all
+        is_numbered: whether states have the numbers that they were given with. False after some were merged.
+        age: (S,) integers that each transition out of a state that is not terminal makes larger. None if they are not
+            known. Solvers take the states in this order then, once.
+        available: (S, A) bool, the actions that exist in each state, one or more, all in terminal states. None: all
             everywhere. Transitions and rewards of the others are the same as for the first available action.
-        names: of states and actions: labels, variables, names of actions; None: the names of the space, if there is
+        names: of states and actions: labels, variables, names of actions. None: the names of the space, if there is
             one.
-        residual: what the sums of rows that were given leave open, see `Residual`; error bounds of values count
-            it.
+        residual: what the sums of rows that were given leave open, see `Residual`. Error bounds of values
+            count it.
     """
 
     dynamics: Dynamics
@@ -124,7 +124,7 @@ class TabularMDP:
 
     @property
     def next_states(self) -> Indices | None:
-        """(S, A) int32, int64 or `PackedIndices`, the next state of each action; -1: the episode ends.
+        """(S, A) int32, int64 or `PackedIndices`, the next state of each action. -1: the episode ends.
 
         None if transitions are not stored so.
         """
@@ -171,12 +171,13 @@ class TabularMDP:
 
     @property
     def width(self) -> int:
-        """W: values and distributions belong to (S, W) pairs; A previous actions under sticky actions, else 1."""
+        """W: values and distributions belong to (S, W) pairs: A previous actions under sticky actions, else 1."""
         return self.chance.width(self.num_actions)
 
     @property
     def policy_width(self) -> int:
-        """Choices of a policy in each state: A + 1 under sticky actions, by the previous action, none last; else 1."""
+        """Choices of a policy in each state: A + 1 under sticky actions, by the previous action, none last. Otherwise
+        1."""
         return self.num_actions + 1 if self.is_sticky else 1
 
     @property
@@ -223,7 +224,7 @@ class TabularMDP:
         return replace(self, horizon=horizon)
 
     def with_rewards(self, rewards: npt.ArrayLike) -> "TabularMDP":
-        """The same MDP with other rewards, (S, A); rewards of terminal states must be 0."""
+        """The same MDP with other rewards, (S, A). Rewards of terminal states must be 0."""
         if self.available is not None and np.shape(rewards) == self.available.shape:
             rewards = filled(np.asarray(rewards, np.float64), self.available)
         table = rewards_of_shape(rewards, self.reward_table.shape)
@@ -234,7 +235,7 @@ class TabularMDP:
         return replace(self, reward_table=table, staying=None, residual=self.residual._replace(rewards=0.0))
 
     def lazy(self, p: float, staying: npt.ArrayLike | None = None) -> "TabularMDP":
-        """The same MDP in which, with probability p, nothing happens; see `lazy_actions`."""
+        """The same MDP in which, with probability p, nothing happens, see `lazy_actions`."""
         if staying is not None:
             stays = self.with_rewards(staying).reward_table
         else:
@@ -261,7 +262,7 @@ class TabularMDP:
         Args:
             labels: name -> (S,) bool, or indices of states.
             variables: name -> (S,) integers or bool.
-            actions: (A,) names; None: numbers.
+            actions: (A,) names. None: numbers.
         Raises:
             ParameterError: they do not fit the MDP.
         """
@@ -274,7 +275,7 @@ class TabularMDP:
 
         Raises:
             ParameterError: there is not one integer for each state, or a transition out of a state that is not terminal
-                leads to a state that is not older; the first one is named.
+                leads to a state that is not older. The first one is named.
         """
         array = np.asarray(age)
         if array.shape != (self.num_states,) or array.dtype.kind not in "iu":
@@ -285,9 +286,9 @@ class TabularMDP:
         return replace(self, age=array)
 
     def order(self) -> TopologicalOrder | None:
-        """An order of the states in which each stands before those it may lead to; None: some can be visited again.
+        """An order of the states in which each stands before those it may lead to. None: some can be visited again.
 
-        Cost: from ages at most a sort; else O(S A) and 16 bytes a state.
+        Cost: from ages at most a sort, else O(S A) and 16 bytes a state.
         """
         if self.age is None:
             return self.dynamics.order(~np.asarray(self.terminal))

@@ -1,6 +1,6 @@
 """Observations: pure functions of the state with a Gymnasium space, chosen when an agent interacts.
 
-`observe(env, "vector")` gives one; calling it with states (N, D) gives N observations. Nothing is stored with the
+`observe(env, "vector")` gives one. Calling it with states (N, D) gives N observations. Nothing is stored with the
 states. Images are loaded when they are first asked for.
 """
 

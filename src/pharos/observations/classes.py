@@ -43,7 +43,7 @@ def observation_classes(
         (S,) int64, the number of the observation of each state, from 0.
     Raises:
         ParameterError: the observation has several frames, so it is no function of the state.
-    Cost: one observation and about 40 bytes for each state; sorting S digests.
+    Cost: one observation and about 40 bytes for each state, and sorting S digests.
     """
     if observation.frames > 1:
         raise ParameterError(
@@ -66,7 +66,7 @@ def history_aliasing(
 ) -> Aliasing:
     """Count the states that an observation of k frames does not tell apart, over all histories that play can have.
 
-    A history is what the last k states of an episode can be; at its start the first state stands k times. A state
+    A history is what the last k states of an episode can be. At its start the first state stands k times. A state
     shares an observation if some history that ends in it gives the same frames as one that ends in another state.
     `num_observations` are the different stacks of frames.
 

@@ -5,9 +5,9 @@ import numpy as np
 from pharos.errors import ParameterError
 from pharos.observations.observation import Observation
 from pharos.observations.vector import Vector
+from pharos.rules import NO_ACTION
 
 Seen = np.ndarray | dict[str, np.ndarray]  # one observation or a batch of them; a dict if there are several parts
-NO_ACTION = -1  # the previous action on the first step of an episode
 
 
 class ObservationInContext:
@@ -17,16 +17,16 @@ class ObservationInContext:
     all 0 on the first step), then the remaining time. Any other observation becomes a Dict of "observation",
     "previous_action" (Discrete(A + 1), A on the first step) and "remaining_time" (Box (1,)).
     The remaining time is (limit - elapsed) / limit, in [0, 1]. Frames and coins, which some observations want
-    besides, are brought along by who knows them; without, a state is seen as at the start of an episode, and coins are
+    besides, are brought along by who knows them. Without, a state is seen as at the start of an episode, and coins are
     0.
 
     Attributes:
         observation: the function of the state.
         space: Gymnasium space of what the agent gets.
-        names: of the entries of a vector; None for others.
+        names: of the entries of a vector, None for others.
         has_more: whether frames or coins are wanted.
         is_alone: whether neither the previous action nor the remaining time is wanted.
-        vector: the observation, if it is one; is_vector: whether it is.
+        vector: the observation, if it is one. is_vector: whether it is.
         is_plain: whether nothing at all is: a function of the state.
     Raises:
         ParameterError: the remaining time is wanted although there is no time limit.

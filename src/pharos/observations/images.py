@@ -1,7 +1,7 @@
 """Simple images, one small plane for each kind of thing, and complex images, sprites on a ground like an Atari screen.
 
-Both come from the rules' `draw`, compiled if possible, over blocks of states; `render` gives them beside the
-pictures for people. Several frames in one image: the last k pictures of an episode, as agents of Atari games see them.
+Both come from the rules' `draw`, compiled if possible, over blocks of states. `render` gives them beside the pictures
+for people. Several frames in one image: the last k pictures of an episode, as agents of Atari games see them.
 
 Source: Mnih et al. (2015), "Human-level control through deep reinforcement learning", methods.
 """
@@ -32,18 +32,18 @@ from pharos.system.threads import in_blocks
 
 
 def num_values(layer: Layer) -> int:
-    """Number of values of a layer's plane, besides 0, that look different; higher ones look like the last."""
+    """Number of values of a layer's plane, besides 0, that look different. Higher ones look like the last."""
     colors = len(layer.color) if np.ndim(layer.color) == 2 else 1
     sprites = len(layer.sprite) if layer.sprite is not None and not isinstance(layer.sprite[0], str) else 1
     return max(len(layer.glyph), colors, sprites)
 
 
 class Drawing:
-    """Runs a drawing kernel of the rules on batches of states; a twin in Python if Numba cannot compile it.
+    """Runs a drawing kernel of the rules on batches of states. A twin in Python if Numba cannot compile it.
 
     Attributes:
-        env: the environment; rows, columns: of its grid. `block` frames are worth a thread's while.
-        motion: whether the planes of `draw_motion` follow those of `draw`; not if the class defines none.
+        env: the environment. rows, columns: of its grid. `block` frames are worth a thread's while.
+        motion: whether the planes of `draw_motion` follow the planes of `draw`. False if the class defines none.
         layers: of all planes.
     Raises:
         ParameterError: the environment declares no grid, no layers or no draw(), or motion is no truth.
@@ -76,7 +76,7 @@ class Drawing:
         in_blocks(lambda first, last: draw(states, first, last, self._planes(), *tables, out), len(states), self._block)
 
     def one(self, state: np.ndarray, out: np.ndarray, *tables: object) -> None:
-        """Draw one state (D,) into out (1, ...); as the call for many, without its cost."""
+        """Draw one state (D,) into out (1, ...), as the call for many, without its cost."""
         if self._compiled is None:
             self._compiled = self._function(state[None], out, tables)
         self._compiled(state[None], 0, 1, self._planes(), *tables, out)
@@ -110,14 +110,14 @@ class Drawing:
 # Frames ---------------------------------------------------------------------------------------------------------------
 
 
-MOST = 16
+MOST_FRAMES = 16
 
 
 class Frames(Observation):
     """An image of one state, or of the last k states of an episode, the oldest first, along the channels.
 
     At the start of an episode the first frame stands k times. As a function of one state it is what an agent sees if
-    an episode starts in that state; otherwise it depends on the k - 1 states before, see `of_histories`.
+    an episode starts in that state. Otherwise it depends on the k - 1 states before, see `of_histories`.
 
     Attributes:
         frames: k.
@@ -125,14 +125,14 @@ class Frames(Observation):
     """
 
     def _stack(self, frames: object, channels: int) -> None:
-        """Set `space` to k stacked frames, if it was the space of one; `channels` is the axis of its channels.
+        """Set `space` to k stacked frames, if it was the space of one. `channels` is the axis of its channels.
 
         Raises:
-            ParameterError: k is no integer from 1 to MOST.
+            ParameterError: k is no integer from 1 to MOST_FRAMES.
         """
         from gymnasium.spaces import Box
 
-        k = whole_number(frames, f"{self.name} of {self.env}: frames", f"1 to {MOST}", most=MOST)
+        k = whole_number(frames, f"{self.name} of {self.env}: frames", f"1 to {MOST_FRAMES}", most=MOST_FRAMES)
         self.frames, self.channel_axis = k, channels
         if k > 1:
             shape = list(self.space.shape or ())
@@ -159,7 +159,7 @@ DARKEST = 128  # of the shades of things on a plane of their own
 class SimpleImage(Frames):
     """One plane for each layer of the environment, channel first: (L, rows k, columns k) uint8, 0 if a cell is empty.
 
-    A layer with one kind of thing shows it as 255; one with several (such as cars of several colours) in even shades
+    A layer with one kind of thing shows it as 255, one with several (such as cars of several colours) in even shades
     from 255 down to 128. Shows the positions of things, not their motion: directions and timers that `draw` leaves out
     cannot be seen without `motion`.
 
@@ -230,7 +230,7 @@ class SimpleImage(Frames):
 
 
 def _shades(layers: Mapping[str, Layer], covering: bool) -> np.ndarray:
-    """(L, 256) uint8, the shade of every value of every layer; values beyond the declared ones look like the last."""
+    """(L, 256) uint8, the shade of every value of every layer. Values beyond the declared ones look like the last."""
     shades = np.zeros((len(layers), 256), np.uint8)
     counts = [num_values(layer) for layer in layers.values()]
     before = np.cumsum(counts) - counts
@@ -264,7 +264,7 @@ class ComplexImage(Frames):
     pixels of each cell, so that a frame costs a few microseconds. Shows what `draw` declares, as simple images do.
 
     Args:
-        size: (height, width) in pixels, (84, 84) as agents of Atari games see; or "natural", as large as the sprites
+        size: (height, width) in pixels, (84, 84) as agents of Atari games see, or "natural", as large as the sprites
             are.
         grey: one channel of luminance instead of three of colour.
         channels_first: (C, height, width).
@@ -374,7 +374,7 @@ def _covered(old: int, new: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _area_weights(old: int, new: int) -> np.ndarray:
-    """(new, old): the share of each old pixel in each new one; rows sum to 1."""
+    """(new, old): the share of each old pixel in each new one. Rows sum to 1."""
     edges = np.arange(new + 1) * old / new
     pixels = np.arange(old)
     overlap = np.minimum(edges[1:, None], pixels + 1) - np.maximum(edges[:-1, None], pixels)
@@ -384,7 +384,7 @@ def _area_weights(old: int, new: int) -> np.ndarray:
 def _sprite_tables(
     layers: Mapping[str, Layer], scenery: Scenery, heights: np.ndarray, widths: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """sprite, offset, color and keep, as `draw_complex` takes them; color still (P, 3) float64."""
+    """sprite, offset, color and keep, as `draw_complex` takes them, with color still (P, 3) float64."""
     rows = len(heights)
     sprite = np.full((len(layers), rows, 256), -1, np.int64)
     images: list[np.ndarray] = []
@@ -451,12 +451,12 @@ def render(env: Environment, state: Sequence[int], observation: str = "human", *
     """Return the picture of `state` under an observation, (H, W, 3) uint8.
 
     Args:
-        observation: "human", another of RENDERERS, or an observation whose values are images; planes stand side by
+        observation: "human", another of RENDERERS, or an observation whose values are images. Planes stand side by
             side.
         options: of the observation, such as `size="natural"` of "complex_image".
     Raises:
         UnknownName: no observation or option of this name. ParameterError: `state` is none of the environment's, or
-            cannot be drawn; the observation is no image.
+        cannot be drawn, or the observation is no image.
     """
     if observation in RENDERERS:
         if options:
@@ -470,7 +470,7 @@ def render(env: Environment, state: Sequence[int], observation: str = "human", *
 
 
 def renderers() -> list[str]:
-    """The names that `render` knows; of the observations, those that may be images."""
+    """The names that `render` knows: of the observations, only those that may be images."""
     return [*RENDERERS, *(name for name in names() if name not in NO_IMAGES)]
 
 
@@ -482,7 +482,7 @@ def _observer(env: Environment, name: str, options: tuple[tuple[str, object], ..
 
 
 def _side_by_side(values: np.ndarray, name: str) -> np.ndarray:
-    """An image (H, W, 3), (H, W, 1) or (H, W) as it is; planes (L, H, W) beside each other with a line between them.
+    """An image (H, W, 3), (H, W, 1) or (H, W) as it is, planes (L, H, W) beside each other with a line between them.
 
     There are never more planes than columns (see `SimpleImage`), so a board of three columns is not taken for colours.
     """

@@ -30,7 +30,7 @@ Function = Callable[[Environment, np.ndarray], np.ndarray]
 
 
 class Observation:
-    """A function of the state for one environment; called with a batch of states it gives a batch of observations.
+    """A function of the state for one environment. Called with a batch of states it gives a batch of observations.
 
     Two options tell an agent something else besides: `frames`, pictures of the states before (images.py), and
     `irrelevant`, coins that are thrown anew at each step (context.py). Who steps an environment brings them along.
@@ -39,8 +39,8 @@ class Observation:
         name: such as "vector".
         env: the environment.
         space: Gymnasium space of one observation.
-        names: of the entries of a one-dimensional observation; None for others.
-        frames: k, if the last k states are seen; else 1.
+        names: of the entries of a one-dimensional observation, None for others.
+        frames: k, if the last k states are seen, else 1.
         irrelevant: how many entries of noise follow a vector.
         is_flat: whether a compiled step may draw it: a pixel is a cell, and each layer has a plane of its own.
         shades: (L, 256) uint8, of an image: the shade of every value on the plane of every layer.
@@ -68,7 +68,7 @@ class Observation:
         raise NotImplementedError(f"{self} has no frames")
 
     def stacked(self, frames: np.ndarray) -> np.ndarray:
-        """(N, *space.shape) of N histories of k frames (N, k, ...), the oldest first; a fresh array."""
+        """(N, *space.shape) of N histories of k frames (N, k, ...), the oldest first, in a fresh array."""
         raise NotImplementedError(f"{self} has no frames")
 
     def of_histories(self, histories: np.ndarray) -> np.ndarray:
@@ -88,8 +88,8 @@ class FunctionObservation(Observation):
     converted to the space's dtype if that keeps their kind (float64 to float32, integers to floats).
 
     Raises:
-        ParameterError: the result has another shape, or a dtype that does not fit; for the start states also if a
-            value lies outside the space.
+        ParameterError: the result has another shape, or a dtype that does not fit. For the start states also if a value
+            lies outside the space.
     """
 
     def __init__(self, env: Environment, function: Function, space: object, *, name: str | None = None):
@@ -172,7 +172,7 @@ def register(name: str, function: Function, space: object) -> None:
     """Make a user's observation known as `observation=name`, so that a spec, a study or a command can name it.
 
     Args:
-        name: a new name; registering it again replaces the function, so that a notebook cell can be run twice.
+        name: a new name. Registering it again replaces the function, so that a notebook cell can be run twice.
         function: function(env, states (N, D) int64) -> (N, *space.shape).
         space: a Gymnasium space, or a function env -> space.
     Raises:
@@ -199,12 +199,12 @@ def observe(
 
     Args:
         env: an Environment, or a name that `pharos.make` knows.
-        observation: a name (see `names`); "module:name" or "file.py:name" of the user's own; a pair (function,
-            Gymnasium space) as in `register`; or an Observation, which is returned.
-        state_space: the built state space; "index" needs it.
+        observation: a name (see `names`), "module:name" or "file.py:name" of the user's own, a pair (function,
+            Gymnasium space) as in `register`, or an Observation, which is returned.
+        state_space: the built state space. "index" needs it.
         options: of the named observation, such as `grey=True`.
     Raises:
-        UnknownName: no such observation or option; the nearest is suggested.
+        UnknownName: no such observation or option. The nearest is suggested.
         ParameterError: the observation does not exist for this environment.
     """
     env = make(env) if isinstance(env, str) else env
@@ -258,12 +258,12 @@ def _is_pair(value: object) -> TypeGuard[tuple[Function, object]]:
 
 @dataclass(frozen=True, eq=False)
 class OwnObservation:
-    """An observation of the user's own for any environment; `observe` takes it in the place of a name.
+    """An observation of the user's own for any environment. `observe` takes it in the place of a name.
 
     Attributes:
         name: under which results speak of it.
         make: (env, **options) -> Observation.
-        source: its origin; None if no other process can import it.
+        source: its origin. None if no other process can import it.
     """
 
     name: str
@@ -278,7 +278,7 @@ def imported(path: str, folder: str | Path | None = None) -> OwnObservation:
     """Import an observation from "module:name" or "file.py:name".
 
     Args:
-        folder: relative files and modules are looked for there first; None: in the current directory.
+        folder: relative files and modules are looked for there first. Default: the current directory.
     Raises:
         ParameterError: no such module, file or name, or it is no observation.
     """
@@ -298,7 +298,7 @@ def observation_of(source: Source, *, trust: bool = False, strict: bool = False)
 
 
 def own_observation(observation: object, folder: str | Path | None = None) -> OwnObservation | None:
-    """The user's own observation of this name, imported or registered before; None for all others."""
+    """The user's own observation of this name, imported or registered before, or None for all others."""
     if isinstance(observation, OwnObservation):
         return observation
     if sources.is_reference(observation):
@@ -338,7 +338,7 @@ def hidden_names(
         choices: what can be hidden, as a message lists it. also: further names.
         option: in whose value they stand.
     Raises:
-        ParameterError: one of them cannot be hidden, or they are no names; the message says what can.
+        ParameterError: one of them cannot be hidden, or they are no names. The message says what can.
     """
     names = [name.strip() for name in hide.split(",") if name.strip()] if isinstance(hide, str) else hide
     if not isinstance(names, Sequence) or not all(isinstance(name, str) for name in names):

@@ -23,7 +23,7 @@ LARGEST_SIDE = 4096
 
 
 class Recorded(Frames):
-    """The image, grid of codes or vector that the import recorded of each state; zeros for the end of an episode.
+    """The image, grid of codes or vector that the import recorded of each state, zeros for the end of an episode.
 
     Images and grids: Box of uint8 from 0 to 255, in the source's own shape. Vectors: Box of float32. Agents of Atari
     games see grey=True, size=84, frames=4: (84, 84, 4).
@@ -35,8 +35,8 @@ class Recorded(Frames):
         size: (height, width) in pixels, or a number for both, to which images are scaled by averaging areas.
         frames: k, the last k images of the episode, the oldest first, along the channels. See `Frames`.
     Raises:
-        ParameterError: nothing was recorded; other environments have pictures of their own. Or what was recorded is no
-            image, and an option is for images.
+        ParameterError: nothing was recorded, as other environments have pictures of their own. Or what was recorded is
+            no image, and an option is for images.
     """
 
     def __init__(

@@ -31,7 +31,7 @@ DIGEST_STATES = 4096  # states whose observations the digest is of
 def network_inputs(observation: Observation, states: np.ndarray) -> np.ndarray:
     """(N, ...) float32 input of the first layer of a network for states (N, D), as Stable-Baselines3 prepares it.
 
-    Pictures of bytes are (C, H, W) in [0, 1]; numbers of categories become ones among zeros.
+    Pictures of bytes are (C, H, W) in [0, 1]. Numbers of categories become ones among zeros.
 
     Raises:
         ParameterError: the space of the observation is none that networks take.
@@ -71,17 +71,17 @@ def ntk(
 
     Args:
         env: an environment, its name, or its state space.
-        observation: as for `observe`; `options` are its options.
-        network: a name such as "mlp128x2" or "cnn16", see `Network`; None: what the agents of pharos get.
+        observation: as for `observe`. `options` are its options.
+        network: a name such as "mlp128x2" or "cnn16", see `Network`. Default: the network of the agents of pharos.
         initialisation: "pytorch" (DQN) or "sb3" (actor-critics), see `Network`.
-        states: (N, D) states; None: all reachable ones, in the order of the state space.
-        others: (M, D) states y; None: the same as `states`.
+        states: (N, D) states. Default: all reachable ones, in the order of the state space.
+        others: (M, D) states y. Default: the same as `states`.
     Returns:
-        (N, M) float32; symmetric if `others` is None. Sums are float64.
+        (N, M) float32, symmetric if `others` is None. Sums are float64.
     Raises:
         ParameterError: the network has no closed form, does not fit the observation, or the kernel does not fit into
             memory. UnknownName: no such environment or observation.
-    Cost: O(N M) times inputs; 4 bytes a pair. 1,500 states: 0.1 s with mlp128x2, 0.5 s with cnn16 on 8 x 8 cells.
+    Cost: O(N M) times inputs, 4 bytes a pair. 1,500 states: 0.1 s with mlp128x2, 0.5 s with cnn16 on 8 x 8 cells.
     Source: Jacot et al. (2018); Cho and Saul (2009) for ReLUs; Arora et al. (2019) for convolutions.
     """
     from pharos.state_space import StateSpace
@@ -122,13 +122,13 @@ def representation(
         observation, options: as for `observe`.
         network, initialisation: as for `ntk`. Or a network of one's own, a function of the shape of an input that
             returns a torch.nn.Module, or its name, "file.py:function" or "module:function": its kernel is the mean over
-            20 random ones, see `empirical_ntk`; initialisation is the function's.
-        landmarks: of the approximation of the kernel, at least 2; None: if there are more than 4,096 different
-            observations; 0: never.
+            20 random ones, see `empirical_ntk`. Initialisation is the function's.
+        landmarks: of the approximation of the kernel, at least 2. Default: if there are more than 4,096 different
+            observations. 0: never.
     Raises:
         ParameterError: the environment's class is not known, the network has no closed form or does not fit the
             observation, the observation has no space that networks take, or landmarks is no number of them.
-    Cost: one observation of each state now; the kernel when a measure asks for it.
+    Cost: one observation of each state now, the kernel when a measure asks for it.
     """
     if space.environment is None:
         raise ParameterError(f"{space}: the class of its environment is not known, so nothing is seen of its states")

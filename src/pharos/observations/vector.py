@@ -16,7 +16,7 @@ from pharos.observations.observation import Observation, hidden_names
 if TYPE_CHECKING:
     from pharos.state_space import StateSpace
 
-MOST_EXACT = 1 << 24  # integers up to here are told apart in float32
+LARGEST_EXACT_INTEGER = 1 << 24  # integers up to here are told apart in float32
 MOST_ONE_HOT = 1 << 20
 MOST_IRRELEVANT = 10
 MOST_STARTS = 4096
@@ -32,11 +32,11 @@ class Vector(Observation):
             them, such as "bricks[0,3]": their entries stay, and are always 0. Or -1 for the last component, -2 for
             the last but one, ...: the same rule for all classes.
         irrelevant: how many entries follow that mean nothing: fair coins, 0 or 1, thrown anew at every step, whatever
-            the state is. As a function of the state they are 0; environments throw them. At most MOST_IRRELEVANT.
+            the state is. As a function of the state they are 0. Environments throw them. At most MOST_IRRELEVANT.
     Attributes:
         low, scale: (D,), the observation is (state - low) * scale.
     Raises:
-        ParameterError: a component has more values than float32 tells apart; or too many irrelevant entries.
+        ParameterError: a component has more values than float32 tells apart, or there are too many irrelevant entries.
     Source: irrelevant features: Rajan et al. (2023), MDP Playground, whose irrelevant part is a chain of its own.
     """
 
@@ -44,11 +44,11 @@ class Vector(Observation):
         from gymnasium.spaces import Box
 
         components = env.components
-        if (components.size > MOST_EXACT).any():
+        if (components.size > LARGEST_EXACT_INTEGER).any():
             i = int(np.argmax(components.size))
             raise ParameterError(
                 f"{env}: {components.names[i]} has {components.size[i]} values; the vector observation tells at most "
-                f"{MOST_EXACT} apart: pass an observation of your own"
+                f"{LARGEST_EXACT_INTEGER} apart: pass an observation of your own"
             )
         self.name = "vector"
         self.env = env
@@ -134,7 +134,7 @@ class OneHot(Observation):
 
 
 class Index(Observation):
-    """The number of the state in a built state space: Discrete(S). Complete; what tabular agents learn from.
+    """The number of the state in a built state space: Discrete(S). It is complete, and what tabular agents learn from.
 
     Raises:
         ParameterError: no state space was given, or one of another environment.
@@ -164,7 +164,7 @@ class Number(Observation):
     Toy text has the numbers of Gymnasium: row x columns + column in frozen_lake and cliff_walking; ((row x size +
     column) x (L + 1) + passenger) x L + destination in taxi with L landmarks, 500 numbers on 5 x 5 cells, which do not
     say whether a fickle passenger may still change his mind. An imported world has the number in its folder, which is
-    the number in the table, matrix or file; 0 for the end of an episode.
+    the number in the table, matrix or file, 0 for the end of an episode.
 
     Raises:
         ParameterError: the source does not number its states.
@@ -204,13 +204,13 @@ class Hash(Observation):
 
     A control for what a representation is worth: it tells the state as a vector does, but states that follow each other
     have words as different as any two. The components of the state, in binary, go through a Feistel network of 6
-    rounds, which permutes the words of this length; so it needs no state space, and is the same on every machine.
+    rounds, which permutes the words of this length. So it needs no state space, and is the same on every machine.
 
     Args:
-        bits: length of the word; None: as many as the components have in binary, and 8 more.
+        bits: length of the word. Default: as many as the components have in binary, and 8 more.
         seed: another one gives other words.
     Raises:
-        ParameterError: fewer bits than write the state, or more than 65,536; a seed below 0.
+        ParameterError: fewer bits than write the state, or more than 65,536, or a seed below 0.
     Source: Luby and Rackoff (1988) for the network.
     """
 

@@ -1,6 +1,6 @@
 """Plots: regret as it grows, values and policies over a grid, policies at play, instances in the plane of hardness.
 
-Each function draws on the matplotlib axes given, or on a new figure, and returns the Figure; `save` writes it. Colours
+Each function draws on the matplotlib axes given, or on a new figure, and returns the Figure. `save` writes it. Colours
 are told apart by colour-blind people (Okabe and Ito, 2008). Nothing opens a window or changes matplotlib's settings.
 """
 

@@ -40,7 +40,7 @@ ARROW_VECTORS = {"up": (0, -1), "down": (0, 1), "left": (-1, 0), "right": (1, 0)
 
 
 ROW_AND_COLUMN = ("row", "column")
-MOST_LETTERS = 40  # a side: beyond it, letters in cells are too small to read
+LONGEST_LETTERED_SIDE = 40  # a side: beyond it, letters in cells are too small to read
 
 
 @styled
@@ -56,9 +56,9 @@ def value_map(
 ) -> "Figure":
     """Draw V over the cells of a grid, or over two other variables, with the actions that the policy may take.
 
-    Over row and column, arrows show all optimal actions of an optimal solution; the arrows of a given policy are as
+    Over row and column, arrows show all optimal actions of an optimal solution. The arrows of your own policy are as
     long as their probability. Over other variables, letters say which actions the policy may take. A dot means that
-    every action is as good. Terminal states are grey and outside of the colours' range; the number is the reward of
+    every action is as good. Terminal states are grey and outside of the colours' range. The number is the reward of
     getting there. A frame marks where episodes start.
 
     Args:
@@ -68,7 +68,7 @@ def value_map(
         fix: name -> value of every other variable, such as {"passenger": 4}: the slice to draw. What has one value in
             it need not be named.
         rest: "start": variables that `fix` does not name are as in the first start state.
-        axes: matplotlib axes to draw on; None for a new figure.
+        axes: matplotlib axes to draw on. Default: a new figure.
     Raises:
         ParameterError: states lack these variables, others are not fixed, or values belong to pairs.
     """
@@ -93,7 +93,7 @@ def value_map(
     drawn.colorbar(image, ax=axis, shrink=0.8, label="value").outline.set_visible(False)
     # The actions of the policy in each cell
     lengths, letters = _lengths(solution), _letters(space.environment.actions)
-    draws_actions = over == ROW_AND_COLUMN or max(size) <= MOST_LETTERS
+    draws_actions = over == ROW_AND_COLUMN or max(size) <= LONGEST_LETTERED_SIDE
     low, high = _range_of(values)
     for s, (row, column) in zip(shown, cells, strict=True):
         value = values[row, column]
@@ -133,8 +133,8 @@ def value_map(
 def _draw_arrows(
     axis: "Axes", cell: tuple[int, int], actions: Sequence[str], lengths: np.ndarray, color: str, letters: Sequence[str]
 ) -> None:
-    """Arrows as long as the actions are probable: one alone in the middle of its cell, several from there; a letter for
-    each action that leads nowhere."""
+    """Arrows as long as the actions are probable: one alone in the middle of its cell, several from there. A letter
+    stands for each action that leads nowhere."""
     column, row = cell
     indices = [int(action) for action in np.flatnonzero(lengths > 0.02)]
     if still := "".join(letters[action] for action in indices if actions[action] not in ARROW_VECTORS):
@@ -151,7 +151,7 @@ def _draw_arrows(
 
 
 def _letters(actions: Sequence[str]) -> list[str]:
-    """A letter for each action: its first one that no other action has; else its number."""
+    """A letter for each action: its first one that no other action has, else its number."""
     letters: list[str] = []
     for number, name in enumerate(actions):
         free = [letter for letter in name if letter.isalnum() and letter not in letters]
@@ -235,7 +235,7 @@ def _lengths(solution: "Solution") -> np.ndarray:
 
 
 def _reward_on_entering(mdp: "TabularMDP", terminal: int) -> str:
-    """Reward of the transitions into a terminal state, as text; empty if they differ or there are none."""
+    """Reward of the transitions into a terminal state, as text, or empty if they differ or there are none."""
     into = mdp.dynamics.leads_to(terminal) & ~np.asarray(mdp.terminal)[:, None]
     rewards = np.unique(mdp.rewards[into])
     return f"{rewards[0]:g}" if len(rewards) == 1 else ""
@@ -255,13 +255,13 @@ def hardness_plane(
     estimation: str = "sum_of_reciprocal_gaps",
     axes: "Axes | None" = None,
 ) -> "Figure":
-    """Draw instances by two measures on logarithmic axes; a diameter that is an interval is drawn as a bar.
+    """Draw instances by two measures on logarithmic axes. A diameter that is an interval is drawn as a bar.
 
     Args:
         reports: name of an instance, such as "breakout/12x8x1", to its report. One colour for each class before the
             slash.
         visitation, estimation: names of measures in the reports.
-        axes: matplotlib axes to draw on; None for a new figure.
+        axes: matplotlib axes to draw on. Default: a new figure.
     Raises:
         ParameterError: no reports, or a report lacks a measure or has no finite value for it.
     """
@@ -351,9 +351,9 @@ def _range(name: str, report: "Report", measure: str) -> tuple[float, float]:
 
 
 def states_by_depth(space: "StateSpace") -> np.ndarray:
-    """(depth + 1,) numbers of states whose shortest way from a start state has 0, 1, ... steps; they sum to S.
+    """(depth + 1,) numbers of states whose shortest way from a start state has 0, 1, ... steps. They sum to S.
 
-    Cost: one read of the successors in blocks; 8 bytes a state of memory.
+    Cost: one read of the successors in blocks, and 8 bytes a state of memory.
     """
     visited = np.zeros(space.num_states, np.bool_)
     frontier = np.unique(space.start_states)
@@ -373,7 +373,7 @@ def growth(spaces: Mapping[str, "StateSpace"], *, axes: "Axes | None" = None) ->
 
     Args:
         spaces: label -> state space.
-        axes: matplotlib axes to draw on; None for a new figure.
+        axes: matplotlib axes to draw on. Default: a new figure.
     Raises:
         ParameterError: no space is given.
     """
@@ -420,7 +420,7 @@ def policies(
         agents: label -> what `training.evaluate_agent` takes: a table (S,) or (S, A), a model, or a function of
             observations.
         path: of the .gif.
-        steps: at most; None for the time limit of the task.
+        steps: at most. Default: the time limit of the task.
         observation: how states are drawn, "human" or an observation that is an image.
         seed: of chance and of random actions.
     Raises:

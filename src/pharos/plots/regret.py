@@ -56,18 +56,18 @@ def regret(
     resamples: int = 1000,
     axes: Sequence[Any] | None = None,
 ) -> "Figure":
-    """Draw the regret of runs over their steps; runs that differ in the seed alone are one line with an interval.
+    """Draw the regret of runs over their steps. Runs that differ in the seed alone are one line with an interval.
 
     Left, the normalised expected regret of the policy learnt so far: 0 is optimal, 1 is playing at random (in units of
     return if playing at random is optimal in one of the tasks). Right, the cumulative realised regret of all
-    episodes played, exploration included; a dotted line is what playing at random would have cost in as many episodes.
+    episodes played, exploration included. A dotted line is what playing at random would have cost in as many episodes.
     If all runs measure the average reward of a step in the long run, both are of the average regret of the policies
     learnt: left a step, right summed over the steps.
 
     Args:
         folders: of finished runs, on any number of tasks.
         confidence, resamples: of the bootstrap interval of the mean over seeds (percentile).
-        axes: two axes to draw on; None for a new figure.
+        axes: two axes to draw on. Default: a new figure.
     Raises:
         FileFormatError: a folder holds no finished run. ParameterError: no folder is given.
     """
@@ -120,7 +120,7 @@ def _groups(folders: Sequence[str | os.PathLike]) -> dict[str, list[tuple[dict[s
 
 
 def _spread(result: dict[str, Any], average: bool) -> float:
-    """Regret of playing at random, of an episode or of a step in the long run; NaN if it is infinite."""
+    """Regret of playing at random, of an episode or of a step in the long run, NaN if it is infinite."""
     if average:
         return (sum(result["optimal_gain_at_start"].values()) - sum(result["uniform_gain_at_start"].values())) / 2
     uniform = result["value_uniform"]
@@ -138,7 +138,7 @@ def _with_averages(curve: "pd.DataFrame", result: dict[str, Any]) -> "pd.DataFra
 
 
 def _labels(configs: list[dict[str, Any]]) -> list[str]:
-    """The label of each group of runs; if two are alike, with discount and horizon, or a number."""
+    """The label of each group of runs. If two are alike, with discount and horizon, or a number."""
     plain_labels = [_label(config, configs) for config in configs]
     labels: list[str] = []
     for config, label in zip(configs, plain_labels, strict=True):
@@ -169,7 +169,7 @@ def _label(config: dict[str, Any], configs: list[dict[str, Any]]) -> str:
 
 
 def _in_words(config: dict[str, Any]) -> str:
-    """`Frozen lake 8x8`; of an imported MDP the name of its folder."""
+    """`Frozen lake 8x8`. For an imported MDP, the name of its folder."""
     if config["environment"] == IMPORTED:
         return Path(config["parameters"]["folder"]).name
     name, *setting = instance_name(config["environment"], config["parameters"]).split(" ")
@@ -219,7 +219,7 @@ def predictions(prediction: "Prediction", *, axes: "Axes | None" = None) -> "Fig
     """Draw a bar for each observation and network, from 0 (optimal) towards 1 (uniform play), with its interval.
 
     Args:
-        axes: matplotlib axes to draw on; None for a new figure.
+        axes: matplotlib axes to draw on. Default: a new figure.
     """
     cells = prediction.cells
     drawn, axis = single(axes, (6.4, 1.1 + 0.42 * len(cells)))

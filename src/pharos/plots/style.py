@@ -96,7 +96,7 @@ def label_edges(axes: Sequence[Any], below: str, beside: str) -> None:
 
 
 def agent_label(agent: str) -> str:
-    """`DQN`; of an algorithm from a module or a file, the name of its class."""
+    """`DQN`. For an algorithm from a module or a file, the name of its class."""
     return agent_called(agent).title
 
 
@@ -135,7 +135,7 @@ def save(figure: "Figure", path: str | os.PathLike, *, follow: bool = True) -> P
 
 
 def save_for_page(draw: Callable[[], "Figure | None"], path: Path) -> dict[str, bytes] | None:
-    """Draw a figure into FILE.png and FILE.pdf; return its PNG for light and for dark pages, None without a figure.
+    """Draw a figure into FILE.png and FILE.pdf. Return its PNG for light and for dark pages, None without a figure.
 
     Args:
         draw: called under the style of either page.

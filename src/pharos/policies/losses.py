@@ -6,7 +6,7 @@ from pharos.solvers import Solution
 
 
 def state_losses(optimal: Solution, visits: np.ndarray, first: np.ndarray | None = None) -> np.ndarray:
-    """Return what a policy loses in each state; the sum over states is V* minus the value of the policy at the start.
+    """Return what a policy loses in each state. The sum over states is V* minus the value of the policy at the start.
 
         loss(s) = chosen * sum over a of visits(s, a) gap(s, a),   gap(s, a) = max over b of q(s, b) - q(s, a)
 
@@ -18,7 +18,7 @@ def state_losses(optimal: Solution, visits: np.ndarray, first: np.ndarray | None
         first: (N, A) probabilities of each choice on the first step in `mdp.start_states`, for sticky actions alone:
             there is no previous action then, so a chosen one is executed with another probability.
     Returns:
-        (S,) float64, at least 0; in units of return, within the errors of `optimal` and `visits`.
+        (S,) float64, at least 0, in units of return, within the errors of `optimal` and `visits`.
     Cost: O(S A).
     Source: the performance difference lemma, Kakade and Langford (2002), Approximately optimal approximate
         reinforcement learning, lemma 6.1.

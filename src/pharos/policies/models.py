@@ -54,8 +54,8 @@ class DeepPolicy:
         masked: whether the model was trained under action masks (MaskablePPO), which come with the observations then.
         imposed: whether masks may be the masks of the batched engine, of whose networks the model itself knows nothing.
     Raises:
-        ParameterError: the policy has a memory, so that its probabilities do not belong to observations; it needs masks
-            and there are none, or takes none; or the VecNormalize that it was trained behind is missing.
+        ParameterError: the policy has a memory, so that its probabilities do not belong to observations. Or it needs
+            masks and there are none, or takes none, or the VecNormalize that it was trained behind is missing.
     """
 
     def __init__(self, model: SB3Model, *, deterministic: bool = False, masked: bool = False, imposed: bool = False):
@@ -273,7 +273,7 @@ NUMBERINGS = {"index": "the search found them", "number": "the source does"}
 def _numbering_of(model: object) -> str | None:
     """Numbering that a model was trained on, by the environment that is attached to it.
 
-    An observation of pharos, or "those of CLASS" for other environments; None if there is no environment.
+    An observation of pharos, or "those of CLASS" for other environments. None if there is no environment.
     """
     env: Any = getattr(model, "env", None)
     while hasattr(env, "venv"):
@@ -287,7 +287,7 @@ def _numbering_of(model: object) -> str | None:
 
 
 def space_difference(expected: object, actual: object, *, is_dtype_compared: bool = True) -> str | None:
-    """Difference of two spaces in kind or size, "shape (3,) beside (4,)"; None if a network sees the same.
+    """Difference of two spaces in kind or size, "shape (3,) beside (4,)", or None if a network sees the same.
 
     Images may have their channels first in `expected`. Bounds are not compared.
     """

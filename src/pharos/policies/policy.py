@@ -60,7 +60,7 @@ class RecurrentPolicy(Protocol):
         """The state of n episodes that begin."""
 
     def __call__(self, observations: Arrays, state: Arrays, starts: np.ndarray) -> tuple[np.ndarray, Arrays]:
-        """((N, A) probabilities or (N,) actions, the next state); starts: (N,) bool, whether an episode begins."""
+        """((N, A) probabilities or (N,) actions, the next state). starts: (N,) bool, whether an episode begins."""
 
 
 PolicyLike = np.ndarray | TabularAgent | Policy | RecurrentPolicy | SB3Model | Callable[[Any], Any]
@@ -92,7 +92,8 @@ def policy_function(policy: PolicyLike, *, masked: bool = False) -> Callable[...
 
 
 def masks_for(policy: PolicyLike, mdp: TabularMDP, masks: "MasksLike | None") -> "MasksLike | None":
-    """Masks under which a policy is asked: as given; else, of one trained under masks, the sets of the MDP, if any."""
+    """Masks under which a policy is asked: as given. Otherwise, for a policy trained under masks, the sets of the MDP,
+    if any."""
     if masks is not None or mdp.available is None:
         return masks
     is_model = isinstance(policy, SB3Model) and not isinstance(policy, Policy)
@@ -180,7 +181,7 @@ class ReachableRows(NamedTuple):
 
     Attributes:
         rows: (N,) in the order in which `QueriedPolicy.reach` visits them.
-        is_whole: whether these are all; False: there are more than `reach` was allowed to visit.
+        is_whole: whether these are all. False: there are more than `reach` was allowed to visit.
     """
 
     rows: np.ndarray
@@ -220,12 +221,12 @@ class QueriedPolicy:
         return self._index[rows] - 1
 
     def query(self, rows: np.ndarray) -> np.ndarray:
-        """(N, A) probabilities of distinct or repeated rows; only new ones are queried."""
+        """(N, A) probabilities of distinct or repeated rows. Only new ones are queried."""
         indices = self.index_after_query(rows)  # before `probabilities`, which it appends to
         return self.probabilities[indices]
 
     def index_after_query(self, rows: np.ndarray) -> np.ndarray:
-        """(N,) index of each row in `rows` and `probabilities`; new ones are queried."""
+        """(N,) index of each row in `rows` and `probabilities`. New ones are queried."""
         indices = self.index(rows)
         if (is_new := indices < 0).any():
             unknown = np.unique(rows[is_new])
@@ -260,7 +261,7 @@ class QueriedPolicy:
         return self._arrivals(next_states, executed)
 
     def reach(self, max_rows: int | None = None, steps: int | None = None) -> bool:
-        """Query the policy in all rows that it reaches within `steps`, level by level; False beyond `max_rows` rows."""
+        """Query the policy in all rows that it reaches within `steps`, level by level. False beyond `max_rows` rows."""
         mdp, frontier, level = self.mdp, self._start_nodes(), 0
         while frontier.size and (steps is None or level < steps):
             level += 1
@@ -293,7 +294,7 @@ class QueriedPolicy:
         return rows[self.index(rows) < 0]
 
     def query_all(self, reach: Callable[[], ReachableRows]) -> bool | None:
-        """Query the policy in all rows of `reach` at once; True.
+        """Query the policy in all rows of `reach` at once. Returns True.
 
         False if there are more rows, and the policy reaches all of these (every action has a positive probability,
         as seen in SOME of them). None if an action has probability 0, so that it may reach less. Then nothing is
@@ -325,7 +326,7 @@ class QueriedPolicy:
         return np.unique(states) if self.mdp.is_sticky else states
 
     def reached_mdp(self) -> tuple[TabularMDP, np.ndarray]:
-        """The MDP on the queried states, and the policy on it; other states have probability 0, and become the end."""
+        """The MDP on the queried states, and the policy on it. Other states have probability 0, and become the end."""
         mdp, states = self.mdp, self.reached_states()
         if not mdp.is_sticky:
             starts = self.index(self.start_rows())
@@ -416,7 +417,7 @@ class ActionMasks:
     """Actions that may be chosen in each state.
 
     Args:
-        masks: (S, A) bool by the states of the MDP; or a function from states (N, D), as a state space gives them, to
+        masks: (S, A) bool by the states of the MDP, or a function from states (N, D), as a state space gives them, to
             (N, A) bool.
     Raises:
         ParameterError: they have another shape or type, or a state that is not terminal has no action.
@@ -465,8 +466,8 @@ class PolicyAnswers(QueriedPolicy):
     Args:
         policy: as `policy_function` takes it.
         deterministic: whether the most probable action is taken.
-        masks: the actions that a model trained under masks may choose, as `ActionMasks` takes them; None: those that
-            are available in the MDP.
+        masks: the actions that a model trained under masks may choose, as `ActionMasks` takes them. Default: the
+            actions that are available in the MDP.
     Raises:
         ParameterError: it is no policy, was trained on other observations, or masks are missing or do not fit.
     """
@@ -529,7 +530,7 @@ class PolicyAnswers(QueriedPolicy):
         return self.checked(self.policy(observations, self.masks.of(states)), count)
 
     def checked(self, answer: ArrayLike, count: int) -> np.ndarray:
-        """(N, A) probabilities of an answer to `count` observations; ParameterError for any other."""
+        """(N, A) probabilities of an answer to `count` observations. ParameterError for any other."""
         answer = np.asarray(answer)
         if answer.dtype.kind in "iu" and answer.shape == (count,):
             if (answer < 0).any() or (answer >= self.num_actions).any():

@@ -1,8 +1,8 @@
 """Value of a policy, which is queried and evaluated in the states that it reaches.
 
-`evaluate_policy` gives the values of all states, `policy_value` the value of the start; `table_values` and
+`evaluate_policy` gives the values of all states, `policy_value` the value of the start. `table_values` and
 `walk_values` give the latter of many policies at once, to the same bits. A deterministic policy in a deterministic game
-of a million states reaches some hundred of them; under chance it may reach many, and beyond a limit the value is
+of a million states reaches some hundred of them. Under chance it may reach many, and beyond a limit the value is
 estimated from simulated episodes instead, and the answer says so.
 
 `estimate`: the value from simulated episodes, with an interval that holds it almost surely. `QueriedHistories`:
@@ -40,14 +40,14 @@ from pharos.policies.policy import (
     masks_for,
 )
 from pharos.solvers import Solution
-from pharos.system.arrays import as_index_array
+from pharos.system.arrays import UNIT_ROUNDOFF, as_index_array
 
 # Histories whose frames are drawn at once
 HISTORY_BATCH = 512
 
 
 class QueriedHistories(PolicyAnswers):
-    """Answers of a policy that sees k frames; a row is the number of a history, the last k states of an episode.
+    """Answers of a policy that sees k frames. A row is the number of a history, the last k states of an episode.
 
     The histories that a policy reaches, with what is executed in them, are an MDP again: a history leads to the one
     without its first state and with the next state behind. So the value of the policy is exact if they are few.
@@ -60,7 +60,7 @@ class QueriedHistories(PolicyAnswers):
         self._name_rows()
 
     def _name_rows(self) -> None:
-        """Number rows by history, whatever the previous action is; the last entry of a history is the state."""
+        """Number rows by history, whatever the previous action is. The last entry of a history is the state."""
         self.by_pairs, self.width = False, 1
         self._histories: list[tuple[int, ...]] = []
         self._number: dict[tuple[int, ...], int] = {}
@@ -130,7 +130,7 @@ class QueriedHistories(PolicyAnswers):
         return np.concatenate(answers)
 
     def _numbers(self, histories: list[tuple[int, ...]]) -> np.ndarray:
-        """Numbers (N,) of histories; new ones are appended."""
+        """Numbers (N,) of histories. New ones are appended."""
         for history in histories:
             if history not in self._number:
                 self._number[history] = len(self._histories)
@@ -139,7 +139,7 @@ class QueriedHistories(PolicyAnswers):
 
 
 class QueriedMemories(QueriedHistories):
-    """Answers of a policy with a memory; a row is the number of (memory, previous action if it is seen, state).
+    """Answers of a policy with a memory. A row is the number of (memory, previous action if it is seen, state).
 
     A memory is what the policy has kept of the observations before. It has one number if the observations before
     were the same, and if what is kept is the same to the last bit: a policy that keeps nothing is queried once about
@@ -195,7 +195,7 @@ class QueriedMemories(QueriedHistories):
         return np.array([self._answered[pair][0] for pair in pairs])
 
     def _memories(self, state: Arrays, count: int) -> list[int]:
-        """Numbers of the memories of `count` episodes, new ones appended; `state` is what the policy returned."""
+        """Numbers of the memories of `count` episodes, new ones appended. `state` is what the policy returned."""
         leaves = _leaves(state)
         layout = [(leaf.dtype, leaf.shape[1:]) for leaf in leaves]
         if any(leaf.dtype.hasobject or leaf.shape[:1] != (count,) for leaf in leaves):
@@ -272,7 +272,6 @@ def policy_answers(
 TAIL = 1e-9
 MOST_ROWS = 1 << 16  # pairs of a state and what came before, so that all of them may be reached by many policies
 MOST_TOGETHER = 1 << 18  # such pairs of the policies that are evaluated at once
-_UNIT = 2.0**-53
 
 
 @dataclass(frozen=True)
@@ -286,8 +285,8 @@ class Evaluation:
             returned. (A network computes them in float32, which moves values by more.) For an estimate, half the width
             of an interval that holds the value with a probability of at least 99 % (empirical Bernstein bound).
         states: number of states (or pairs of state and previous action) in which the policy was asked.
-        episodes: simulated episodes behind an estimate; 0 if the value is exact.
-        gain: average reward a step in the long run, within proven bounds; None unless it was asked for.
+        episodes: simulated episodes behind an estimate, 0 if the value is exact.
+        gain: average reward a step in the long run, within proven bounds. None unless it was asked for.
     """
 
     value: float
@@ -313,12 +312,12 @@ def policy_value(
 ) -> Evaluation:
     """Return the value of a policy from the start: exact if it reaches few states, else estimated with a bound.
 
-    A total reward (gamma 1, no horizon) is -inf if the policy may go on for ever and pays on average; NaN if it goes on
-    for ever and pays nothing on average, though something each time, so that its sum has no limit.
+    A total reward (gamma 1, no horizon) is -inf if the policy may go on for ever and pays on average. It is NaN if it
+    goes on for ever and pays nothing on average, though something each time, so that its sum has no limit.
 
     Args:
-        observer: gives what the policy sees; called for policies over observations alone.
-        return_range: gives the lowest and the highest return of an episode; called if the value is estimated.
+        observer: gives what the policy sees. It is called for policies over observations alone.
+        return_range: gives the lowest and the highest return of an episode. It is called if the value is estimated.
         deterministic, masks, max_states, episodes, seed: as for `training.evaluate_agent`.
         reach: (rows at most, steps) -> the rows that every policy of positive probabilities reaches, if more than
             one policy is evaluated: such policies are queried in all of them at once. Changes no value.
@@ -354,7 +353,7 @@ def endless_value(mdp: TabularMDP, policy: np.ndarray | str) -> float:
     """The total reward of a policy that goes on for ever while something is paid, in an MDP whose optimum is finite.
 
     Returns:
-        -inf if it pays on average; else NaN, as the sums of positive and of negative rewards are both infinite.
+        -inf if it pays on average, else NaN, as the sums of positive and of negative rewards are both infinite.
     """
     return -math.inf if solvers.average_reward(mdp, policy).gain_at_start.upper < 0 else math.nan
 
@@ -400,25 +399,25 @@ def evaluate_policy(
     what is executed, see `random_actions` and `sticky_actions`.
 
     Args:
-        policy: (S,) integers, an action for each state; or (S, A) probabilities. Under sticky actions also (S, A + 1)
-            integers or (S, A + 1, A) probabilities, for each previously executed action and, last, for none; or a
+        policy: (S,) integers, an action for each state, or (S, A) probabilities. Under sticky actions also (S, A + 1)
+            integers or (S, A + 1, A) probabilities, for each previously executed action and, last, for none. Or a
             function from an array of state indices to either. Or a policy that sees observations: a model of
             Stable-Baselines3, or, with `observation`, a function of a batch of observations that returns (N, A)
             probabilities or (N,) actions. One with a memory has no values of states, see `training.evaluate_agent`.
         tolerance: every value is within this of the true one, proven. Or the options of `pharos.solvers.Solving`.
         horizon: number of steps to go, instead of the MDP's own.
-        observation: what the policy sees, a name or an Observation; of models "vector" when not given.
-        processes: that share the work, for policies over states; see `pharos.value_iteration`.
+        observation: what the policy sees, a name or an Observation. Default for models: "vector".
+        processes: that share the work, for policies over states, see `pharos.value_iteration`.
         observer_options: further options of policies that see observations: `observation_options`, a dictionary;
             `previous_action`, whether they see it, under sticky actions; `deterministic`, whether the most probable
             action is taken; `masks`, the actions that a model trained under masks (MaskablePPO) may choose, (S, A) bool
             or a function from states (N, D), as `StateSpace.states` gives them, to (N, A) bool.
     Returns:
         A Solution of kind "policy", see `pharos.solvers.evaluate_policy`. A policy that sees observations is asked only
-        in the states that it reaches from the start; values elsewhere are NaN.
+        in the states that it reaches from the start. Values elsewhere are NaN.
     Raises:
-        ParameterError: the policy has the wrong shape, or its rows are not probabilities; or it sees observations, and
-            the MDP was not made from a state space (the observation "number" is of any table); or a model was trained
+        ParameterError: the policy has the wrong shape, or its rows are not probabilities. Or it sees observations, and
+            the MDP was not made from a state space (the observation "number" is of any table). Or a model was trained
             on other observations, behind a VecNormalize that is not with it, or under masks that are not given.
         DivergenceError: gamma is 1, there is no horizon, and the policy goes on for ever while something is paid.
     Source: Puterman (1994), section 6.1.
@@ -442,7 +441,7 @@ def evaluate_policy(
 
 
 class AverageRegret(NamedTuple):
-    """Loss of a policy a step in the long run, from the start; each number within proven bounds.
+    """Loss of a policy a step in the long run, from the start, with each number within proven bounds.
 
     Attributes:
         regret: the optimal gain less the gain of the policy. gain, optimal: of the policy, and of the best one.
@@ -481,7 +480,7 @@ def average_regret(
     Returns:
         An `AverageRegret` of the intervals `regret`, `gain` and `optimal`. Regret is never negative.
     Raises:
-        ParameterError: the policy has the wrong shape, or its rows are not probabilities; or as `evaluate_policy`.
+        ParameterError: the policy has the wrong shape, its rows are not probabilities, or as for `evaluate_policy`.
         PrecisionError: floats, within limits of time, prove no bound within the tolerance.
     Cost: twice the cost of `average_reward`.
     Source: Auer, Jaksch and Ortner (2009), "Near-optimal regret bounds for reinforcement learning".
@@ -513,10 +512,10 @@ def policy_gain(
     tolerance: float = 1e-6,
     **options: Unpack[AnswerOptions],
 ) -> solvers.GainInterval | None:
-    """The average reward a step of a policy in the long run, from the start; None if it reaches more than `max_states`.
+    """The average reward a step of a policy in the long run, from the start. None if it reaches more than `max_states`.
 
     Args:
-        observer: gives what the policy sees; called for policies over observations alone.
+        observer: gives what the policy sees. It is called for policies over observations alone.
         tolerance: the gain is within this of the middle of its bounds.
         options: `deterministic` and `masks`, as for `training.evaluate_agent`.
     """
@@ -530,7 +529,7 @@ def policy_gain(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ReachedSolution(Solution):
-    """Values of a policy in the states that it reaches from the start, numbered as in the whole MDP; NaN elsewhere.
+    """Values of a policy in the states that it reaches from the start, numbered as in the whole MDP. NaN elsewhere.
 
     Attributes:
         start: value of an episode's first state.
@@ -557,7 +556,7 @@ def _solution_of_reached(
     deterministic: bool = False,
     masks: MasksLike | None = None,
 ) -> ReachedSolution:
-    """Values of a policy that sees observations; `training.evaluate_agent` also gives estimates.
+    """Values of a policy that sees observations. `training.evaluate_agent` also gives estimates.
 
     Raises:
         ParameterError: the MDP was not made from a state space of an environment, the policy is none for its
@@ -597,7 +596,7 @@ def _solution_of_reached(
 
 
 def _observer_of(mdp: TabularMDP, observation: object, options: dict[str, object], previous_action: bool) -> Observer:
-    """Observer of the states of an MDP; ParameterError if there is nothing to observe."""
+    """Observer of the states of an MDP. ParameterError if there is nothing to observe."""
     space = mdp.space
     if space is None and observation == "number" and mdp.is_numbered:
         if options or previous_action:
@@ -612,7 +611,7 @@ def _observer_of(mdp: TabularMDP, observation: object, options: dict[str, object
 
 
 def _on_all_states(answers: QueriedPolicy, x: np.ndarray) -> np.ndarray:
-    """(S + 1, W): values on the states that the policy reaches (N + 1, W), NaN elsewhere; 0 in terminal states."""
+    """(S + 1, W): values on the states that the policy reaches (N + 1, W), NaN elsewhere, and 0 in terminal states."""
     mdp = answers.mdp
     states = answers.reached_states()
     rows = states[:, None] * answers.width + np.arange(mdp.width)
@@ -626,7 +625,7 @@ def _on_all_states(answers: QueriedPolicy, x: np.ndarray) -> np.ndarray:
 def steps_that_matter(mdp: TabularMDP) -> tuple[int, float]:
     """Number of steps whose rewards decide the value at the start up to an error, and a bound on that error.
 
-    Without a horizon 2 gamma^n max |r| / (1 - gamma), below TAIL; the policy is not queried about later steps.
+    Without a horizon 2 gamma^n max |r| / (1 - gamma), below TAIL. The policy is not queried about later steps.
     """
     if mdp.horizon is not None:
         return mdp.horizon, 0.0
@@ -654,7 +653,7 @@ def table_values(mdp: TabularMDP, policies: Sequence[np.ndarray]) -> list[Evalua
     They are evaluated as one policy of as many copies of the MDP: to the bits that `policy_value` gives.
 
     Args:
-        policies: (S,) actions each, evaluated in all states; or (S, A) probabilities, evaluated in states they reach.
+        policies: (S,) actions each, evaluated in all states. Or (S, A) probabilities, evaluated in states they reach.
     Cost: one backward induction for all, in some groups if they are large.
     """
     size, evaluations = max(1, MOST_TOGETHER // _rows(mdp)), []
@@ -709,14 +708,14 @@ def walk_values(
 ) -> list[Evaluation]:
     """The values of N deterministic policies from the start, exact, each in its own MDP of which `is_walk` holds.
 
-    Such a policy visits one state after the other, so that evaluating it alone costs a call of `act` for each; here one
+    Such a policy visits one state after the other, so that evaluating it alone costs a call of `act` for each. Here one
     call serves a step of all policies.
 
     Args:
-        act: (N,) states -> (N,) actions, of the policies in their states; those whose episode is over are queried in
-            their last state.
+        act: (N,) states -> (N,) actions, of the policies in their states. Policies at the end of an episode are queried
+            in their last state.
         frames: k, the number of states that the policies see. If more than one, `act` gets histories (N, k): the last
-            k states of the episode, the oldest first; the first state stands for those before it.
+            k states of the episode, the oldest first. The first state stands for earlier ones.
     Cost: the longest episode times a call of `act`.
     """
     worlds = {
@@ -748,7 +747,7 @@ def walk_values(
             state[i] = np.where(next_states < 0, s, next_states)
         history = np.concatenate([history[:, 1:], state[:, None]], axis=1)
         discount *= gammas
-    bounds = [tail for _, tail in ahead] + 2 * _UNIT * (len(path) + 1) * size + of_rewards
+    bounds = [tail for _, tail in ahead] + 2 * UNIT_ROUNDOFF * (len(path) + 1) * size + of_rewards
     visited = [
         len(np.unique(column[column[:, 0] >= 0], axis=None if frames == 1 else 0))
         for column in np.array(path, np.int64).reshape(-1, len(mdps), frames).swapaxes(0, 1)

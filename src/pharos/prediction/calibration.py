@@ -15,7 +15,7 @@ from pharos.agents import primary_predictors
 from pharos.errors import ParameterError
 from pharos.prediction.pairs import CLEAR, Pairs
 
-FILE = Path(__file__).parent / "data" / "cells.csv"
+CELLS_FILE = Path(__file__).parent / "data" / "cells.csv"
 BINS = (0.0, 0.05, 0.1, 0.2, 0.4)
 """Lower ends of the predicted differences that are counted together."""
 LEVEL = 0.8
@@ -32,7 +32,7 @@ COMMON: dict[str, dict[str, object]] = {
     },
 }
 """Hyperparameters of the published cells: those of the presets hardness-dev and hardness-sealed."""
-NUMBERS = ("predicted", "observed", "states", "steps", "spread")
+NUMBER_COLUMNS = ("predicted", "observed", "states", "steps", "spread")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +41,7 @@ class OrderCounts:
 
     Attributes:
         pairs: all of them. right: those in which the one that was predicted to have less regret had less, however
-            little; a tie is not right.
+            little. A tie is not right.
         clear_pairs, clear_right: the same of the pairs whose regrets differ by more than `CLEAR`.
     """
 
@@ -58,7 +58,7 @@ class Published:
     Attributes:
         classes: (N,) names of the classes of environments, which weigh alike.
         mdps: (N,) study, instance and chance of each.
-        predicted, observed: (N,) normalised regret of the learnt policies, 0 optimal and 1 uniform play; observed is
+        predicted, observed: (N,) normalised regret of the learnt policies, 0 optimal and 1 uniform play. observed is
             the mean over evaluations and seeds.
         states: (N,) numbers of states. steps: (N,) of training. spreads: (N,) V* - U, in return.
     """
@@ -79,7 +79,7 @@ class Published:
 
         Args:
             but: a class that is left out.
-        Source: Lei et al. (2018), split conformal prediction; Dunn, Wasserman and Ramdas (2023) for groups.
+        Source: Lei et al. (2018), split conformal prediction, and Dunn, Wasserman and Ramdas (2023) for groups.
         """
         use = self.classes != but
         errors, classes = np.abs(self.observed - self.predicted)[use], self.classes[use]
@@ -129,8 +129,8 @@ def published(agent: str) -> Published:
         raise ParameterError(
             f"agent {agent!r}: no published runs to calibrate on; expected one of {', '.join(primary_predictors())}"
         )
-    with FILE.open(newline="", encoding="utf-8") as file:
+    with CELLS_FILE.open(newline="", encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file) if row["agent"] == agent]
     mdps = [" ".join((row["study"], row["instance"], row["chance"])) for row in rows]
-    numbers = (np.array([float(row[name]) for row in rows]) for name in NUMBERS)
+    numbers = (np.array([float(row[name]) for row in rows]) for name in NUMBER_COLUMNS)
     return Published(np.array([row["environment"] for row in rows]), np.array(mdps), *numbers)

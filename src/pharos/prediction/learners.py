@@ -16,7 +16,13 @@ if TYPE_CHECKING:
 
 Network = str | Callable[[tuple[int, ...]], Any]
 """A name, or a function of the shape of an input: `pharos.observations.representation`."""
-MEASURES = ("kernel_regret", "kernel_learning_time", "kernel_sample_complexity", "aliasing_floor", "exploration_time")
+LEARNER_MEASURES = (
+    "kernel_regret",
+    "kernel_learning_time",
+    "kernel_sample_complexity",
+    "aliasing_floor",
+    "exploration_time",
+)
 PREDICTORS = (
     *("kernel_regret", "kernel_regret_played", "adam_regret", "adam_regret_played"),
     *("tabular_regret", "tabular_regret_played"),
@@ -27,13 +33,13 @@ PREDICTORS = (
 
 def predicted(config: Mapping[str, Any], *, primary: bool = False) -> dict[str, Any]:
     """Return PREDICTORS of a run, the columns of its agent's idealised learner (`pharos.agents.Idealised`), and their
-    curves; and the measures that a user has registered, under their names.
+    curves, and the measures that a user has registered, under their names.
 
     Args:
         config: of a run of a study that was read already, so that code which it names is trusted.
-        primary: the idealised learner alone, with its table; `estimated_error` is then its own.
+        primary: the idealised learner alone, with its table. `estimated_error` is then its own.
     Returns:
-        Numbers, NaN if there is none and `notes` says why; `network`, `estimated_error`, `curve`, `adam_curve`.
+        Numbers, NaN if there is none and `notes` says why, `network`, `estimated_error`, `curve`, `adam_curve`.
     """
     from pharos.hardness import report
 
@@ -50,7 +56,7 @@ def predicted(config: Mapping[str, Any], *, primary: bool = False) -> dict[str, 
         idealised = agent_called(config["agent"]).idealised
         schedule = idealised.schedule(config)
         user_measures = own_measures()
-        measures = report(task.mdp, (*MEASURES, *user_measures), schedule=schedule, **options)
+        measures = report(task.mdp, (*LEARNER_MEASURES, *user_measures), schedule=schedule, **options)
         rescaled = report(task.mdp, ["kernel_regret"], schedule=replace(schedule, optimizer="adam"), **options)
         row |= idealised.columns(config, task.mdp, options)
     except PharosError as error:
@@ -68,7 +74,7 @@ def predicted(config: Mapping[str, Any], *, primary: bool = False) -> dict[str, 
             "adam_regret_played": regret["played"],
             "adam_curve": curve_points(regret),
         }
-    for measure in (*MEASURES[1:], *user_measures):
+    for measure in (*LEARNER_MEASURES[1:], *user_measures):
         value = measures[measure].value
         if value is not None:
             row[measure] = float(value["value"] if isinstance(value, Mapping) else value)
@@ -123,7 +129,7 @@ class PrimaryRegret:
     Attributes:
         network: its name.
         value: normalised regret of the learnt policies, a mean over training: 0 optimal, 1 uniform play.
-        deviation: standard deviation of one walk of the idealised learner; NaN if nothing is drawn.
+        deviation: standard deviation of one walk of the idealised learner, NaN if nothing is drawn.
         tabular: of the same learner with a table of the states in the place of the network.
         note: what is random in it, and what half of the landmarks change if they stand for the kernel.
     """
@@ -145,7 +151,7 @@ def primary_regret(
 
     Args:
         config: of the run. task: its task.
-        network: as `pharos.observations.representation` takes it; None: the agent's own, with its `net_arch`.
+        network: as `pharos.observations.representation` takes it. Default: the agent's own, with its `net_arch`.
     Raises:
         ParameterError: the agent has no such learner, the network does not fit, or the kernel is too large.
         UndefinedMeasure: no policy beats uniform play.

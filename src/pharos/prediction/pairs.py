@@ -45,13 +45,13 @@ class Pairs:
         return self._right(x, x)
 
     def _right(self, values: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """(..., M) of values (..., N) of x at other indices; NaN if one of a pair is."""
+        """(..., M) of values (..., N) of x at other indices, NaN if one of a pair is."""
         difference = values[..., self.first] - values[..., self.second]
         is_rounding = np.abs(difference) <= TIE_TOLERANCE * (x.max(initial=-np.inf) - x.min(initial=np.inf))
         return 0.5 + 0.5 * np.where(is_rounding, 0.0, np.sign(difference)) * self.sign
 
     def agreement(self, x: np.ndarray) -> float:
-        """The share of pairs that x orders rightly; NaN without pairs."""
+        """The share of pairs that x orders rightly, NaN without pairs."""
         return float(self.right(x).mean()) if len(self.first) else np.nan
 
     def ceiling(self, y: np.ndarray, noise: np.ndarray) -> float:
@@ -62,7 +62,7 @@ class Pairs:
         for means that are normal about their expectations, under a flat prior on the difference of two expectations.
 
         Args:
-            y, noise: (N,) of cells: the mean over seeds, and the variance over seeds / seeds; NaN of a single seed.
+            y, noise: (N,) of cells: the mean over seeds, and the variance over seeds / seeds. NaN for a single seed.
         Returns:
             NaN if no pair has two seeds in both of its cells.
         """
@@ -77,7 +77,7 @@ class Pairs:
         return float(ndtr(difference / deviation).mean())
 
     def interval(self, x: np.ndarray, classes: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
-        """95 % interval of the agreement over samples of classes; (NaN, NaN) without any, or if fewer than two
+        """95 % interval of the agreement over samples of classes. (NaN, NaN) without any, or if fewer than two
         classes have pairs.
 
         Args:
@@ -106,7 +106,7 @@ class Pairs:
         So a class whose instances all prefer the same observation counts once. NaN if no pair is left.
 
         Args:
-            x, classes, mdps, observations: (N,) of cells; classes and MDPs are numbers from 0.
+            x, classes, mdps, observations: (N,) of cells. Classes and MDPs are numbers from 0.
             permutations: R.
         """
         names = {name: i for i, name in enumerate(dict.fromkeys(observations))}

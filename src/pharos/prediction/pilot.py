@@ -14,9 +14,9 @@ from pharos.prediction.calibration import Published
 if TYPE_CHECKING:
     from pharos.training import Task
 
-SHARES = (0.1, 0.25, 0.5)
+PILOT_SHARES = (0.1, 0.25, 0.5)
 EVALUATIONS = 30  # of a whole run
-FILE = Path(__file__).parent / "data" / "pilots.csv"
+PILOTS_FILE = Path(__file__).parent / "data" / "pilots.csv"
 
 
 class Plane:
@@ -55,11 +55,13 @@ def plane(agent: str, share: float) -> Plane:
     """Return the plane of an agent's pilots: of the second sealed test, 98 cells of 14 classes an agent.
 
     Raises:
-        ParameterError: the share is none of SHARES.
+        ParameterError: the share is none of PILOT_SHARES.
     """
-    if share not in SHARES:
-        raise ParameterError(f"pilot is {share!r}; expected one of {', '.join(map(str, SHARES))}, shares of the steps")
-    with FILE.open(newline="", encoding="utf-8") as file:
+    if share not in PILOT_SHARES:
+        raise ParameterError(
+            f"pilot is {share!r}; expected one of {', '.join(map(str, PILOT_SHARES))}, shares of the steps"
+        )
+    with PILOTS_FILE.open(newline="", encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file) if row["agent"] == agent]
     x = np.array([[float(row[str(share)]), float(row["predicted"])] for row in rows])
     return Plane(np.array([row["environment"] for row in rows]), x, np.array([float(row["others"]) for row in rows]))
@@ -77,7 +79,7 @@ def cut(hyperparameters: Mapping[str, Any], share: float) -> dict[str, Any]:
 
 
 def pilot_regret(agent: str, task: "Task", steps: int, hyperparameters: Mapping[str, Any], share: float) -> float:
-    """Train one seed for a share of the steps; return its mean regret so far.
+    """Train one seed for a share of the steps, and return its mean regret so far.
 
     Raises:
         MissingExtra: torch is not installed.

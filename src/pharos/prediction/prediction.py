@@ -45,8 +45,8 @@ class PredictedRegret(PrimaryRegret):
 
     Attributes:
         observation: what the agent sees, with its options.
-        low, high: ends of the interval that held LEVEL of the published cells, at least 0; also `lower` and `upper`.
-        pilot: mean regret of a pilot so far, NaN without one; `value` is then what it and the idealised learner say.
+        low, high: ends of the interval that covered LEVEL of the published cells, at least 0. Also `lower` and `upper`.
+        pilot: mean regret of a pilot so far, NaN without one. `value` is then what it and the idealised learner say.
     """
 
     observation: str
@@ -80,7 +80,7 @@ class PairOrder:
 
     Attributes:
         easier, harder: labels. difference: of the predicted regrets.
-        counts: of the published pairs whose predictions differ about as much; of networks, of all their pairs.
+        counts: of the published pairs whose predictions differ about as much. For networks, of all their pairs.
         of_networks: whether the cells differ in their networks.
     """
 
@@ -137,8 +137,8 @@ class Prediction:
         environment, chance, agent, steps: what they are about. states: number of states.
         predictor: name of the measure that stands for the agent.
         cells: one for each observation and network, in the order in which they were asked for.
-        half_width: half of the interval that held LEVEL of the published cells; coverage: the share that such intervals
-            held of classes left out; published_cells, published_classes: numbers of both.
+        half_width: half of the interval that covered LEVEL of the published cells. coverage: the share that such
+            intervals covered of classes left out. published_cells, published_classes: numbers of both.
         warnings: ways in which the instance lies outside of what was tested.
         hyperparameters: of the agent.
     """
@@ -159,7 +159,7 @@ class Prediction:
 
     @property
     def orders(self) -> list[PairOrder]:
-        """Orders of the easiest cell and each other one; the easiest is named first. None with pilots, as nobody has
+        """Orders of the easiest cell and each other one. The easiest is named first. None with pilots, as nobody has
         counted how often those are right.
         """
         if not math.isnan(self.cells[0].pilot):
@@ -221,21 +221,21 @@ def predict(
         observations: names as for `pharos.observe`, alone or with their options: ("hash", {"bits": 64}).
         agent: "dqn" or "ppo".
         networks: as for `pharos.observations.representation`, such as "mlp64x2" or a function of an input's shape that
-            returns a torch.nn.Module; several: each with each observation. None: the agent's own.
+            returns a torch.nn.Module. With several, each is used with each observation. Default: the agent's own.
         steps: of training.
         landmarks: as for `representation`.
         common: use the hyperparameters of the published cells, in place of the class's.
         pilot: train one seed of the real agent for this share of the steps (0.1, 0.25 or 0.5), too. Values and
             intervals are then of the pilot and the idealised learner together.
         progress: called with what is being done.
-        options: sticky, random, lazy, reward_noise, scale_rewards, horizon and hyperparameters, as for `pharos.train`;
+        options: sticky, random, lazy, reward_noise, scale_rewards, horizon and hyperparameters, as for `pharos.train`,
             and parameters of the environment.
     Returns:
         A Prediction, whose cells have a value and an interval, and whose orders say which is easier.
     Raises:
         ParameterError: no such agent, observation or network, or more than MOST_STATES states.
         UndefinedMeasure: no policy beats uniform play, so that regret has no scale.
-    Cost: seconds for each cell of a thousand states; see `sampled_regret` and `kernel_policy_regret`. Measures are kept
+    Cost: seconds for each cell of a thousand states, see `sampled_regret` and `kernel_policy_regret`. Measures are kept
         beside the state space.
     """
     from pharos.agents import hyperparameters as hyperparameters_of
@@ -302,7 +302,8 @@ def regret_predictor(
     """Return the function of hyperparameters that gives the predicted regret, a mean over environments and chances.
 
     For `pharos.training.tune(predicted=...)`: what the idealised learner knows is the discount, the exploration, the
-    target network and the layers of a DQN; the discount, the rollouts, epochs, lambda, clipping and layers of a PPO.
+    target network and the layers of a DQN, and the discount, the rollouts, epochs, lambda, clipping and layers of a
+    PPO.
 
     Args:
         agent: "dqn" or "ppo". environments, observation, steps: of the runs. chances: as for `tune`.

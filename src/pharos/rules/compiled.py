@@ -47,7 +47,7 @@ def exploration_kernels(
 def interaction_kernels(
     cls: type[Environment], names: tuple[str, ...], num_actions: int, outcomes: int = 1, motion: bool = False
 ) -> "InteractionKernels":
-    """The kernels of `interaction.py`; with motion they draw the planes of `draw_motion` behind the planes of
+    """The kernels of `interaction.py`. With motion they draw the planes of `draw_motion` behind the planes of
     `draw`."""
     from pharos.rules.interaction import interaction
 
@@ -109,7 +109,7 @@ class CompiledExpansion(_Compiled):
         self._check(states, stop, progress, failure)
 
     def _check(self, states, stop: int | None, progress, failure: Exception | None) -> None:
-        """Raise a RuleError if a rule failed or left the ranges in a state before `stop`; None: in any of them."""
+        """Raise a RuleError if a rule failed or left the ranges in a state before `stop`. None: in any of them."""
         from pharos.kernels.hash_table import COUNT, FAULT, FIRST  # which stepping does without
 
         if failure or progress[FAULT]:
@@ -119,14 +119,15 @@ class CompiledExpansion(_Compiled):
             blame(self.env, self.layout, states[first : min(first + _SUSPECTS, stop)], failure)
 
     def _rows(self, terminal, probabilities) -> Rows:
-        """Arrays that kernels write beside the successors: terminal; with chance or an age, probabilities as well."""
+        """Arrays that kernels write beside the successors: terminal, and with chance or an age probabilities as
+        well."""
         return terminal if self._is_plain else (terminal, probabilities)
 
     def _expand(self, *arrays: object) -> None:
         self.kernels.expand_and_find(self.parameters, self.layout.tables, *arrays)
 
     def component_at_fault(self, states, i: int, keys, terminal, probabilities) -> int | None:
-        """Expand state i alone, its successors to its rows of keys; the component that it leaves, or None.
+        """Expand state i alone, its successors to its rows of keys. Returns the component that it leaves, or None.
 
         The number of components stands for one that does not exist, the next one for a probability or an age.
         """
@@ -243,7 +244,7 @@ class CompiledStepping:
         self._mark_available(self.parameters, states, out)
 
     def step_and_draw_one(self, *arguments: object) -> Function | None:
-        """The kernel that steps and draws, compiled for these arguments; None if `draw` does not compile."""
+        """The kernel that steps and draws, compiled for these arguments, or None if `draw` does not compile."""
         try:
             self._step_and_draw_one(self.parameters, *arguments)
         except Exception:  # Numba raises its own errors, and others from inside of it
@@ -252,7 +253,7 @@ class CompiledStepping:
 
 
 class CompiledDrawing:
-    """A kernel that draws states, with the parameters of one environment; see `rules.Rules.drawing`.
+    """A kernel that draws states, with the parameters of one environment, see `rules.Rules.drawing`.
 
     Args:
         kernel: its name in interaction.py. arguments: of the first call, for no states.

@@ -36,13 +36,13 @@ CompiledRules = dict[str, Function]
 """Rules by their names."""
 Constructor = Callable[..., tuple[object, ...]]
 """The class of `self` in compiled rules, a named tuple."""
-RULES = ("transition", "is_terminal", "reward", "draw")
+COMPILED_RULES = ("transition", "is_terminal", "reward", "draw")
 _COLOURS = re.compile("\x1b\\[[0-9;]*m")  # Numba writes them if colorama is installed
 _RULES_FOLDER = Path(__file__).parent
-_KERNELS = _RULES_FOLDER.parent / "kernels"
+_KERNELS_FOLDER = _RULES_FOLDER.parent / "kernels"
 _MACHINERY = (
     *(_RULES_FOLDER / name for name in ("compiler.py", "exploration.py", "interaction.py", "packed_view.py")),
-    *(_KERNELS / name for name in ("hash_table.py", "stepping.py")),
+    *(_KERNELS_FOLDER / name for name in ("hash_table.py", "stepping.py")),
 )
 
 
@@ -54,7 +54,7 @@ def rules_of_class(cls: type[Environment]) -> tuple[str, ...]:
         "is_available": cls.is_available is not Environment.is_available,
         "draw_motion": cls.draw_motion is not Environment.draw_motion,
     }
-    return RULES + tuple(rule for rule, is_defined in optional.items() if is_defined)
+    return COMPILED_RULES + tuple(rule for rule, is_defined in optional.items() if is_defined)
 
 
 def numeric_attributes(env: Environment) -> tuple[tuple[str, ...], tuple[object, ...]]:

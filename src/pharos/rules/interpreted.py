@@ -24,10 +24,10 @@ class Branches(NamedTuple):
     """Next states of N states by B branches each: A actions, or, with chance, outcome k of action a as branch a K + k.
 
     Attributes:
-        next_states: (N B, D) int64, or uint8 if it suffices; terminal states and impossible outcomes lead to the
+        next_states: (N B, D) int64, or uint8 if it suffices. Terminal states and impossible outcomes lead to the
             state itself.
         terminal: (N,) bool.
-        probabilities: (N, B) float64; None without chance.
+        probabilities: (N, B) float64, or None without chance.
     """
 
     next_states: np.ndarray
@@ -41,7 +41,7 @@ def interpreted_branches(env: Environment, rows: list[list[int]]) -> Branches:
     Args:
         rows: N states, D integers each.
     Raises:
-        RuleError: a rule raised an exception or broke its contract; names the state, the action and the outcome.
+        RuleError: a rule raised an exception or broke its contract. It names the state, the action and the outcome.
     """
     if env.has_chance or env.has_age:
         return _outcomes(env, rows)
@@ -55,9 +55,9 @@ def interpreted_successors(env: Environment, rows: list[list[int]]) -> tuple[np.
         rows: N states, D integers each.
     Returns:
         (N * A, D) int64, or uint8 if it suffices: row i * A + a the successor of state i by action a, terminal
-        states leading to themselves; and (N,) bool, which states are terminal.
+        states leading to themselves. And (N,) bool, which states are terminal.
     Raises:
-        RuleError: a rule raised an exception or left the declared ranges; names the state and the action.
+        RuleError: a rule raised an exception or left the declared ranges. It names the state and the action.
     """
     quick = _small_successors(env, rows)
     if quick is not None:
@@ -137,7 +137,7 @@ def _transition(env: Environment) -> Callable[..., None]:
 
 
 def _array(out: list[list[int]]) -> np.ndarray:
-    """The successors as an array; an empty one if they are no integers of one length."""
+    """The successors as an array, an empty one if they are no integers of one length."""
     try:
         return np.array(out, np.int64)
     except (ValueError, TypeError, OverflowError):
@@ -145,7 +145,7 @@ def _array(out: list[list[int]]) -> np.ndarray:
 
 
 def check_successor(env: Environment, state: tuple[int, ...], action: int, out: list[int], which: str = "") -> None:
-    """Raise a RuleError if `out` is no state; `which`: the outcome, in words."""
+    """Raise a RuleError if `out` is no state. `which`: the outcome, in words."""
     components = env.components
     where = f"{env}: {which}action {env.actions[action]!r} in state {state}"
     if len(out) != len(components):
@@ -182,7 +182,7 @@ def _outcomes(env: Environment, rows: list[list[int]]) -> Branches:
 
 
 def outcome_probabilities(env: Environment, state: tuple[int, ...], action: int) -> list[float]:
-    """The probabilities of the K outcomes of an action; RuleError if they are no distribution."""
+    """The probabilities of the K outcomes of an action. RuleError if they are no distribution."""
     probabilities = []
     for outcome in range(env.outcomes):
         where = f"{env}: probability of outcome {outcome} of action {env.actions[action]!r} in state {state}"
@@ -205,7 +205,7 @@ def outcome_probabilities(env: Environment, state: tuple[int, ...], action: int)
 
 
 def _outcome(env: Environment, state: tuple[int, ...], action: int, outcome: int) -> list[int]:
-    """The next state by an outcome; RuleError if that is no state, or not older than `state`."""
+    """The next state by an outcome. RuleError if that is no state, or not older than `state`."""
     which = f"outcome {outcome} of " if env.takes_outcomes() else ""
     out = list(state)
     try:
@@ -269,7 +269,7 @@ class InterpretedExpansion:
         indices[missing] = -1 - slots
 
     def _expand(self, states: np.ndarray, keys: np.ndarray, terminal: np.ndarray, probabilities: np.ndarray) -> None:
-        """Successors of packed states to keys, packed; terminal states and impossible outcomes lead to the state."""
+        """Successors of packed states to keys, packed. Terminal states and impossible outcomes lead to the state."""
         layout = self.layout
         unpacked = np.empty((len(states), len(layout.word)), np.int64)
         unpack_rows(layout.word, layout.shift, layout.mask, layout.low, states, unpacked)
@@ -331,7 +331,7 @@ class InterpretedRewards:
         return out.reshape(-1, num_actions)
 
     def _reward(self, state: tuple[int, ...], action: int, next_state: tuple[int, ...], rank: int = 0) -> float:
-        """The reward of the possible outcome with this rank among the outcomes of (state, action); -1: without
+        """The reward of the possible outcome with this rank among the outcomes of (state, action), -1 without
         effect."""
         env = self.env
         try:
@@ -424,7 +424,7 @@ class Interpreters:
 
 
 def _send(connection: Connection, states: np.ndarray) -> bool:
-    """Send states to a process; whether it is alive."""
+    """Send states to a process. Return whether it is alive."""
     try:
         connection.send_bytes(np.ascontiguousarray(states).data)
     except OSError:  # it was killed
@@ -433,7 +433,7 @@ def _send(connection: Connection, states: np.ndarray) -> bool:
 
 
 def _received(connection: Connection, rows: int, env: Environment) -> Branches | None:
-    """The branches that another process sends; None if it was killed, or if a rule fails.
+    """The branches that another process sends. None if it was killed, or if a rule fails.
 
     This process then calls the rules itself, and raises the error.
     """

@@ -1,9 +1,8 @@
-"""Layout of states in 64-bit words: the position of each component; integer vectors <-> packed states.
+"""Layout of states in 64-bit words: the position of each component, and integer vectors <-> packed states.
 
 Component i with `size[i]` values takes ceil(log2(size[i])) bits and holds value - low[i]. Components follow one another
-in the order of declaration; one that would straddle two words starts the next word. The rule is part of the file
-format. `kernels.hash_table` has compiled twins of both functions for a few states at a time; this file loads no
-Numba.
+in the order of declaration. One that would straddle two words starts the next word. The rule is part of the file
+format. `kernels.hash_table` has compiled twins of both functions for a few states at a time. This file loads no Numba.
 """
 
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ import numpy as np
 from pharos.environments import Components
 from pharos.errors import ParameterError
 
+NO_ACTION = -1  # the previous action on the first step of an episode
 AT_ONCE = 64
 """States for each component up to which all components are unpacked at once; of more, one after another."""
 

@@ -3,7 +3,7 @@
 Two engines run them, the first that can:
 
     compiled     by Numba, inside the loops that search, step and draw (compiled.py)
-    interpreted  in Python, state by state; while building, in as many processes as there are workers (interpreted.py,
+    interpreted  in Python, state by state, while building in as many processes as there are workers (interpreted.py,
                  stepping.py)
 
 If Numba cannot compile a rule, this file gives one warning for each class of environments and use, and takes the
@@ -46,7 +46,7 @@ class Expansion(Protocol):
 
     See exploration.py for the arrays. A state has B branches: one for each of A actions, or, with chance, branch a K +
     k for outcome k of action a, of which impossible ones lead to the state itself. `probabilities` (rows, B) gets the
-    probabilities of the branches; it has no rows without chance.
+    probabilities of the branches. It has no rows without chance.
 
     Raises:
         RuleError: a rule failed, or left the declared ranges.
@@ -96,7 +96,7 @@ class TransitionRewards(Protocol):
         """Number of threads that may call `block` at a time, of `workers`."""
 
     def block(self, states: np.ndarray, successors: Indices, terminal: np.ndarray, start: int, stop: int) -> np.ndarray:
-        """Rewards (stop - start, A) float64 of states [start, stop); 0 in terminal states.
+        """Rewards (stop - start, A) float64 of states [start, stop), 0 in terminal states.
 
         Raises:
             RuleError: the rule raised an exception.
@@ -115,10 +115,10 @@ class TransitionRewards(Protocol):
         """Expected rewards (stop - start, A) of states [start, stop), with chance.
 
         Args:
-            outcomes: three arrays: which (N,) int64, ascending, (s - start) A + a of each outcome; successors
-                (N,) int64, its next state; probabilities (N,).
+            outcomes: three arrays: which (N,) int64, ascending, (s - start) A + a of each outcome, successors (N,)
+                int64, its next state, and probabilities (N,).
             ranks: (N,) int64, which one of the possible outcomes of its state and action each is, -1 for an action
-                without effect; no entries: they are all, in their order.
+                without effect. Without entries they are all, in their order.
             largest: (1,) float64, raised to the largest absolute reward that was averaged with a different one.
         """
 
@@ -131,7 +131,7 @@ class Ages(Protocol):
 
 
 class Stepping(Protocol):
-    """Steps of one environment and of many; states are rows of int64. See interaction.py for the arrays.
+    """Steps of one environment and of many. States are rows of int64. See interaction.py for the arrays.
 
     Attributes:
         parameters: the first argument of each function.
@@ -156,28 +156,28 @@ class Stepping(Protocol):
         vector: np.ndarray,
         /,
     ) -> tuple[float, int]:
-        """(reward, code) of one step; next_state gets the next state, vector its vector.
+        """(reward, code) of one step. next_state gets the next state, vector its vector.
 
-        branch: an action, or a K + k for outcome k of K of action a; -1 - a: action a without effect.
+        branch: an action, or a K + k for outcome k of K of action a, or -1 - a for action a without effect.
         """
 
     def step_many(
         self, parameters: tuple[object, ...], setting: Setting, batch: EnvironmentBatch, first: int, last: int, /
     ) -> int:
-        """One step of many environments; returns -1, or i D + c if component c of environment i left its range."""
+        """One step of many environments. Returns -1, or i D + c if component c of environment i left its range."""
 
     def is_terminal_one(self, parameters: tuple[object, ...], state: np.ndarray, /) -> bool:
         """Whether a state is terminal."""
 
     def mark_available(self, states: np.ndarray, out: np.ndarray) -> None:
-        """out[n, a] = whether action a is available in states[n], (N, D); all are in terminal states."""
+        """out[n, a] = whether action a is available in states[n], (N, D). All are in terminal states."""
 
     def step_and_draw_one(self, *arguments: object) -> Callable[..., tuple[float, int]] | None:
-        """The function that steps and draws, for these arguments after the parameters; None if there is none."""
+        """The function that steps and draws, for these arguments after the parameters. None if there is none."""
 
 
 class Rules:
-    """The rules of one environment, each use by the fastest engine that can; nothing is compiled before it is used.
+    """The rules of one environment, each use by the fastest engine that can. Nothing is compiled before it is used.
 
     Attributes:
         env: the environment. layout: of its components in packed states.
@@ -220,7 +220,7 @@ class Rules:
             return False
 
     def rewards_of(self, num_states: int) -> TransitionRewards:
-        """Rewards of the transitions of `num_states` states in all; few are interpreted."""
+        """Rewards of the transitions of `num_states` states in all. Few are interpreted."""
         from pharos.rules.interpreted import InterpretedRewards
 
         is_small = num_states * self.env.num_actions * self.env.outcomes < compiling.SMALL_STATES // 4
@@ -245,7 +245,7 @@ class Rules:
         return InterpretedAges(self.env, self.layout)
 
     def available(self, states: np.ndarray) -> np.ndarray | None:
-        """(N, A) bool, the actions that exist in each of the states (N, D); None if every action exists everywhere."""
+        """(N, A) bool, the actions that exist in each of the states (N, D). None if every action exists everywhere."""
         if not self.env.has_sets:
             return None
         out = np.empty((len(states), self.env.num_actions), np.bool_)
@@ -283,7 +283,7 @@ class Rules:
         return interpreted if compiled is None else compiled
 
     def reason_not_compiled(self) -> str:
-        """The reason why Numba does not compile exploration and rewards; "" if it does. Does not warn."""
+        """The reason why Numba does not compile exploration and rewards, or "" if it does. Does not warn."""
         return "".join(_reason(engine, self.env, self.layout)[1] for engine in (CompiledExpansion, CompiledRewards))
 
 
@@ -305,7 +305,7 @@ _warned: set[tuple[type, object]] = set()
 
 
 def compiled_or_none(engine: Callable[..., Engine], env: Environment, *arguments: object) -> Engine | None:
-    """The compiled engine; None, after one warning for each class, if Numba cannot compile it."""
+    """The compiled engine. None, after one warning for each class, if Numba cannot compile it."""
     compiled, reason = _reason(engine, env, *arguments)
     if reason and (type(env), engine) not in _warned:
         _warned.add((type(env), engine))
@@ -320,7 +320,7 @@ def not_compiled(reason: str) -> str:
 
 
 def _reason(engine: Callable[..., Engine], env: Environment, *arguments: object) -> tuple[Engine | None, str]:
-    """(engine, ""), or (None, the reason why there is none); a class that failed to compile once is not tried again."""
+    """(engine, ""), or (None, the reason why there is none). A class that failed to compile once is not tried again."""
     failed = _reasons.setdefault((engine, type(env)), {})
     try:
         key = (signature_of(env), *(each for each in arguments if isinstance(each, str))) if failed else None
@@ -332,7 +332,7 @@ def _reason(engine: Callable[..., Engine], env: Environment, *arguments: object)
 
 
 def _record_failure(failed: Reasons, env: Environment, arguments: tuple, reason: str) -> str:
-    """Store why instances like `env` do not compile; returns the reason."""
+    """Store why instances like `env` do not compile. Returns the reason."""
     with contextlib.suppress(Exception):  # of a parameter that cannot be read: the class is tried again
         failed[signature_of(env), *(each for each in arguments if isinstance(each, str))] = reason
     return reason

@@ -5,8 +5,7 @@ import numpy as np
 from pharos.environments import Environment
 from pharos.kernels import stepping
 from pharos.kernels.stepping import SAME_STEP
-
-NO_ACTION = -1  # the previous action on the first step of an episode
+from pharos.rules.layout import NO_ACTION
 
 
 class InterpretedStepping:

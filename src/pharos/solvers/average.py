@@ -1,4 +1,5 @@
-"""Long-run average reward, the *gain*, of the best, the worst or a given policy, with bounds from both sides; and bias.
+"""Long-run average reward, the *gain*, of the best, the worst or a given policy, with bounds from both sides, and its
+bias.
 
 Nodes are states, under sticky actions pairs (state, previously executed action). With T_a h(n) = r(n, a) + sum_m
 p(m | n, a) h(m):
@@ -7,7 +8,7 @@ p(m | n, a) h(m):
    so that all have the same best gain g. For any h whatever, g <= max T_a h(n) - h(n) over all nodes and choices, and a
    policy a has at least min T_a h(n) - h(n) over all nodes: the bounds come from one backup, its rounding included.
 2. A good h is the bias of the best policy. Damped sweeps h + (T h - h) / 2 - constant, which converge if a chain is
-   periodic, too; then policy iteration from there. A policy is solved for by what it earns, and the steps it takes,
+periodic, too. Then policy iteration from there. A policy is solved for by what it earns, and the steps it takes,
    until it comes back to one node. A policy with several recurrent classes is led to the best one first: in an end
    component it can be.
 3. Components become one node each, which may stop and be paid its gain. Then the gain of a node is a total reward
@@ -15,7 +16,7 @@ p(m | n, a) h(m):
 
 A policy makes a Markov chain, whose recurrent classes are its end components, and with one choice a node the same three
 steps hold. Its bias is what it earns beyond its gain, h = lim sum over t of E r_t - g: in a recurrent class h is known
-up to a constant, which is such that the stationary mean of h is 0; elsewhere h is the total of r - g until a class is
+up to a constant, which is such that the stationary mean of h is 0. Elsewhere h is the total of r - g until a class is
 entered, and then its bias. All are expected sums until a node is reached, each within what its residual proves.
 
 Source: Puterman (2005), sections 8.2, 8.5, 9.1, 9.5; Haviv and Puterman (1991), "An improved algorithm for solving
@@ -78,11 +79,11 @@ class AverageReward:
     """The long-run average reward of a policy, from each state.
 
     Attributes:
-        mdp: with no horizon, whatever was given; its discount does not count.
+        mdp: with no horizon, whatever was given. Its discount does not count.
         kind: "optimal", "worst" or "policy".
-        gain: `lower` and `upper` (S,), the average reward a step in the long run; proven.
-        policy: one whose gain is as near to the optimal (or worst) one as the bounds are; or the one that was given:
-            (S,) actions; or (S, A) probabilities, under sticky actions (S, A + 1) actions or (S, A + 1, A).
+        gain: `lower` and `upper` (S,), proven bounds of the average reward a step in the long run.
+        policy: one whose gain is as near to the optimal (or worst) one as the bounds are, or the one that was given:
+            (S,) actions or (S, A) probabilities, under sticky actions (S, A + 1) actions or (S, A + 1, A).
         tolerance: half of the widest interval of a gain, at most.
 
     Under sticky actions the numbers of a state belong to an episode that starts in it, without a previous action.
@@ -137,15 +138,15 @@ def average_reward(
     episode ends, nothing more is paid, so the gain is 0.
 
     Args:
-        policy: None or "optimal"; "uniform"; "worst"; or a policy as `evaluate_policy` takes it.
+        policy: None or "optimal", "uniform", "worst", or a policy as `evaluate_policy` takes it.
         tolerance: each gain is within this of the middle of its bounds.
     Returns:
         An `AverageReward` with `gain`, `gain_at_start`, `policy` and `bias`.
     Raises:
         ParameterError: the policy has the wrong shape. UnknownName: no such policy.
         PrecisionError: floats, within limits of time, prove no bound within the tolerance.
-    Cost: nodes and outcomes are written out, 12 bytes an outcome; sweeps, and linear equations of some policies of each
-        end component; of components of more than 20,000 nodes if elimination fills little in, else sweeps alone.
+    Cost: nodes and outcomes are written out, 12 bytes an outcome. Sweeps, and linear equations of some policies of each
+        end component, in components of more than 20,000 nodes if elimination fills little in, else sweeps alone.
     Source: Puterman (2005), chapters 8 and 9; Ashok et al. (2017).
     """
     mdp = mdp.with_horizon(None)
@@ -185,7 +186,7 @@ def _precision_error(mdp: TabularMDP, tolerance: float) -> PrecisionError:
 
 
 def _components(nodes: WrittenOut, select: Selection) -> tuple[np.ndarray, np.ndarray]:
-    """((N,) end component of each node, -1: none; (N C,) bool, the choices that stay in one)."""
+    """((N,) end component of each node, -1 for none, (N C,) bool, the choices that stay in one)."""
     if isinstance(select, PolicyTable):
         return recurrent_classes(nodes.matrix, nodes.live)
     components = end_components(nodes.mdp)
@@ -195,7 +196,7 @@ def _components(nodes: WrittenOut, select: Selection) -> tuple[np.ndarray, np.nd
 def _gains(
     nodes: WrittenOut, component: np.ndarray, inside: np.ndarray, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """((K,) the gain of each component, to be maximised; (K,) the error of each; (N,) choices that attain it)."""
+    """((K,) the gain of each component, to be maximised, (K,) the error of each, (N,) choices that attain it)."""
     total, per_node = int(component.max(initial=-1)) + 1, nodes.per_node
     rows = np.flatnonzero(inside)
     labels = component[rows // per_node]
@@ -227,7 +228,7 @@ def _gains(
 
 
 def _inner(nodes: WrittenOut, rows: np.ndarray) -> Choices:
-    """The choices (R,) of one component, by node; the last column of their outcomes is never reached."""
+    """The choices (R,) of one component, by node. The last column of their outcomes is never reached."""
     from scipy import sparse
 
     members, owner = np.unique(rows // nodes.per_node, return_inverse=True)
@@ -281,7 +282,7 @@ class MeanPayoff:
         return self.upper - self.lower <= 2 * tolerance * (1 - 2.0**-20)
 
     def _bound(self, h: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Take the bounds of h (M + 1,); return ((R,) residuals, (R,) error of each, (M,) best rows)."""
+        """Take the bounds of h (M + 1,). Return ((R,) residuals, (R,) error of each, (M,) best rows)."""
         choices = self.choices
         total, slack = choices.residuals(h)
         slack = slack + choices.error
@@ -293,7 +294,7 @@ class MeanPayoff:
         return total, slack, best
 
     def _improve(self, tolerance: float) -> bool:
-        """Policy iteration from the policy so far; whether the bounds are near enough."""
+        """Policy iteration from the policy so far. Return whether the bounds are near enough."""
         policy, choices = self.policy, self.choices
         for _ in range(MOST_GAIN_IMPROVEMENTS):
             policy, class_of = self._towards_one_class(policy)
@@ -311,7 +312,7 @@ class MeanPayoff:
         return False
 
     def _in_rational_numbers(self) -> bool:
-        """The same in rational numbers, if floats do not hold h; whether there was room for them."""
+        """The same in rational numbers, if floats do not hold h. Return whether there was room for them."""
         from pharos.solvers.rational import best_mean, fractions_of
 
         small = self.choices.num_nodes <= DENSE and not self.choices.deviation
@@ -333,7 +334,7 @@ class MeanPayoff:
         return False
 
     def _towards_one_class(self, policy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(A policy (M,) with one recurrent class, the best one of a policy; (M,) 0 inside the class, else -1)."""
+        """(A policy (M,) with one recurrent class, the best one of a policy, (M,) 0 inside the class, else -1)."""
         choices, nodes = self.choices, np.ones(self.choices.num_nodes, np.bool_)
         class_of, _ = recurrent_classes(choices.matrix[policy], nodes)
         if not class_of.max() > 0:
@@ -369,7 +370,7 @@ class Sweeps:
         self._leaving = np.asarray(choices.matrix.sum(axis=1)).ravel()
 
     def go_on(self, sweeps: int, tolerance: float) -> bool:
-        """Sweep so often, or until the span of T h - h is a half of what the tolerance allows; whether it is."""
+        """Sweep so often, or until the span of T h - h is a half of what the tolerance allows. Return whether it is."""
         choices, h = self.choices, self.h
         for _ in range(sweeps):
             total = choices.rewards + choices.matrix @ h - self._leaving * h[choices.owner]
@@ -406,7 +407,7 @@ class Sums:
         self.chain = Chain(matrix, float)
 
     def until(self, b: np.ndarray) -> np.ndarray:
-        """(M + 1,) x of b (M,), as floats have it; NaN if it cannot be solved for."""
+        """(M + 1,) x of b (M,), as floats have it, or NaN if it cannot be solved for."""
         x = np.zeros(self.num_nodes + 1)
         x[self.nodes] = self.chain.solve(b[self.nodes])[:-1]
         return x
@@ -461,11 +462,11 @@ def _homes(matrix: "csr_matrix", class_of: np.ndarray) -> np.ndarray:
 def _solved(
     choices: Choices, policy: np.ndarray, class_of: np.ndarray, inside: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """((M + 1,) h, 0 at the home of each class; (K,) mean rewards) of a policy; NaN if it is not solved for.
+    """((M + 1,) h, 0 at the home of each class, (K,) mean rewards) of a policy, NaN if it is not solved for.
 
     Args:
         class_of: (M,) the recurrent class of each node, -1: none.
-        inside: (M,) bool: the nodes to solve for: the nodes of the classes; others, too, if there is one class.
+        inside: (M,) bool: the nodes to solve for: the nodes of the classes, and others, too, if there is one class.
     """
     home = _homes(choices.matrix[policy], class_of)
     inside = inside.copy()

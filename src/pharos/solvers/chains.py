@@ -96,7 +96,7 @@ class Chain:
         elimination.factorize(*self._parts, leaving, self._pivot, work)
 
     def solve(self, right: np.ndarray) -> np.ndarray:
-        """(M + 1,) x of b (M,), 0 at the end; infinite or NaN if numbers are too small, or it is too large."""
+        """(M + 1,) x of b (M,), 0 at the end. Infinite or NaN if numbers are too small, or it is too large."""
         with np.errstate(all="ignore"):
             x, least, own = self._solved(right), math.inf, np.arange(len(right))
             for _ in range(0 if np.iscomplexobj(x) else REFINEMENTS):
@@ -126,7 +126,7 @@ class Chain:
 
 
 def _place_of_least_degree(pattern: "csr_matrix") -> np.ndarray:
-    """(M,) the index of each node in an order of minimum degree, of a symmetric pattern; or another, if all is lost."""
+    """(M,) the index of each node in an order of minimum degree, of a symmetric pattern, or another, if all is lost."""
     from scipy import sparse
     from scipy.sparse import csgraph, linalg
 

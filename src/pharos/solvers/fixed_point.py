@@ -16,14 +16,14 @@ largest sum of probabilities, which is 1 up to the rounding of what was given.
 Values that follow from x are as accurate: q = r + gamma E x has an error of at most rho D + e <= D.
 
 Values of 32 bits. Backups are computed in 64 bits, and what is stored is the nearest float of 32: with |v| the largest
-backup it is off by at most s = 2^-24 |v| + 2^-150. That is one more rounding of a new entry, so e becomes e + s; and d,
-which sweeps tell of the backups before they are stored, becomes d + s: D <= (rho (d + s) + e + s) / (1 - rho).
+backup it is off by at most s = 2^-24 |v| + 2^-150. That is one more rounding of a new entry, so e becomes e + s. And d,
+which sweeps report of the backups before they are stored, becomes d + s: D <= (rho (d + s) + e + s) / (1 - rho).
 
 Values component by component: if play cannot come back to a state, the states that it leads to are solved first.
 
 A strongly connected component needs the values of those that it leads to, and no others. Sweeps over all states
-go on over those that are long settled, and a component settles only after those behind it; one after another, from the
-last to the first, each is swept until it is settled, and states without a cycle once.
+go on over those that are long settled, and a component settles only after the components behind it. One after another,
+from the last to the first, each is swept until it is settled, and states without a cycle once.
 
 Its result is a better x to go on sweeping from, like the result of policy_iteration.py: the bound of `fixed_point`
 comes from the next sweep over all states, and nothing has to be proven of components.
@@ -49,9 +49,9 @@ from pharos.solvers.convergence import (
     sweeps_left,
 )
 from pharos.solvers.policy_iteration import PolicyIteration
+from pharos.system.arrays import UNIT_ROUNDOFF
 from pharos.system.memory import SHARE_OF_VALUES, available_memory, large_zeros
 
-_UNIT = 2.0**-53
 M = TypeVar("M", bound="TabularMDP | Part")
 Numbers = TypeVar("Numbers", float, np.ndarray)
 # Half a unit in the last place of 32 bits, for numbers from 1 to 2, and for the smallest ones.
@@ -66,7 +66,7 @@ class FixedPoint(NamedTuple):
     """The fixed point of a backup.
 
     Attributes:
-        x: (S + 1, W) float64 or float32: V(s, b), row S the end; W previous actions under sticky actions, else 1.
+        x: (S + 1, W) float64 or float32: V(s, b), row S the end. W previous actions under sticky actions, else 1.
         bound: every entry is within this of the true one.
         sweeps: what it took.
     """
@@ -80,7 +80,7 @@ class Backup(Generic[M]):
     """The Bellman backup T of an MDP under a selection of actions: the best, the worst, or the actions of a policy.
 
     Attributes:
-        dtype: that values are stored in; backups are computed in 64 bits.
+        dtype: that values are stored in. Backups are computed in 64 bits.
         is_single: whether that is float32.
     """
 
@@ -108,7 +108,7 @@ class Backup(Generic[M]):
         chance, dynamics = self.mdp.chance, self.mdp.dynamics
         executed = chance.chosen * mass + chance.previous + chance.uniform
         is_exact = mass == 1.0 and dynamics.mass == 1.0 and chance.is_none
-        return self.mdp.gamma * (1.0 if is_exact else max(1.0, executed * dynamics.mass) * (1 + 8 * _UNIT))
+        return self.mdp.gamma * (1.0 if is_exact else max(1.0, executed * dynamics.mass) * (1 + 8 * UNIT_ROUNDOFF))
 
     @property
     def patience(self) -> float:
@@ -116,7 +116,7 @@ class Backup(Generic[M]):
         return SETTLING + math.ceil(1 / (1 - self.factor))
 
     def zeros(self) -> np.ndarray:
-        """(S + 1, W); mapped from a file if memory has little room for it."""
+        """(S + 1, W), mapped from a file if memory has little room for it."""
         return large_zeros((self.mdp.num_states + 1, self.mdp.width), self.dtype, share=SHARE_OF_VALUES)
 
     def __call__(self, x: np.ndarray, out: np.ndarray) -> np.ndarray:
@@ -126,7 +126,7 @@ class Backup(Generic[M]):
         return out
 
     def sweep(self, x: np.ndarray, part: tuple[int, int] | None = None) -> float:
-        """Set x to T x in place, from the last state to the first if possible; return the largest change.
+        """Set x to T x in place, from the last state to the first if possible. Return the largest change.
 
         part: the range of states [start, stop) alone, if transitions are in arrays.
         """
@@ -146,7 +146,7 @@ class Backup(Generic[M]):
         Rewards that are means have errors of their own, which any choice between them passes on once. 0 if whole
         numbers are added up, and 53 bits hold them.
         """
-        bound = self.operations * (_UNIT * (rewards + largest) + 2.0**-1074) + self.rounding_of_rewards
+        bound = self.operations * (UNIT_ROUNDOFF * (rewards + largest) + 2.0**-1074) + self.rounding_of_rewards
         return bound * np.logical_not(rewards + largest <= self._exact_to)
 
     def stored(self, largest: float) -> float:
@@ -158,7 +158,7 @@ class Backup(Generic[M]):
         return largest * (1 + 4 * _UNIT32) + 4 * _LEAST32 if self.is_single else largest
 
     def changed(self, change: float, largest: float) -> float:
-        """A bound on the change of stored entries of at most `largest`; `change` is the change of a sweep, which
+        """A bound on the change of stored entries of at most `largest`. `change` is the change of a sweep, which
         compares backups before they are stored, and which some dynamics compute in 32 bits.
         """
         if not self.is_single:
@@ -177,10 +177,10 @@ def fixed_point(
     progress: Callable[[int, float], None] | None = None,
     x: np.ndarray | None = None,
 ) -> FixedPoint:
-    """Sweep until the proven bound is at most the tolerance; at gamma = 1 no state may be visited twice.
+    """Sweep until the proven bound is at most the tolerance. At gamma = 1 no state may be visited twice.
 
     Args:
-        x: (S + 1, W) of the backup's dtype, to sweep in, from any finite values; None: from zeros.
+        x: (S + 1, W) of the backup's dtype, to sweep in, from any finite values. None: from zeros.
     Raises:
         PrecisionError: floats cannot reach the tolerance.
     """
@@ -211,7 +211,7 @@ def fixed_point(
 
 
 def _in_single(backup: Backup[TabularMDP], convergence: Convergence, x: np.ndarray) -> FixedPoint:
-    """Fixed point in values of 32 bits, by sweeps alone; if these would not end, in 64 bits, rounded to 32 bits at
+    """Fixed point in values of 32 bits, by sweeps alone. If these would not end, in 64 bits, rounded to 32 bits at
     last: near gamma = 1 rounding to 32 bits adds up over 1 / (1 - gamma) sweeps."""
     tolerance = convergence.tolerance
     while True:
@@ -276,7 +276,7 @@ def chain_bound(mdp: TabularMDP, select: Selection, x: np.ndarray, successor: np
 def within_residual(mdp: TabularMDP, bound: float, x: np.ndarray) -> float:
     """The error bound of a fixed point x, enlarged so that it holds for every MDP within the residual of this one.
 
-    (gamma d |V| + e) / (1 - gamma), see `Residual`; at gamma = 1 the sum over the steps of the longest path.
+    (gamma d |V| + e) / (1 - gamma), see `Residual`. At gamma = 1 the sum over the steps of the longest path.
     """
     if not any(mdp.residual):
         return bound
@@ -286,7 +286,7 @@ def within_residual(mdp: TabularMDP, bound: float, x: np.ndarray) -> float:
 
 
 def largest_of(x: np.ndarray) -> float:
-    """max |x|; NaN if an entry is NaN."""
+    """max |x|, NaN if an entry is NaN."""
     flat = x.reshape(-1)  # one long row: faster
     largest = 0.0
     for start in range(0, flat.size, _LARGEST_BLOCK):  # each is read once, which counts if x is in a file
@@ -343,7 +343,7 @@ WORTH = 5e8
 # States under sticky actions that are swept in one call, at least.
 LEAST_PART = 512
 # Sweeps over all states that an attempt may cost, at most: near gamma = 1 the number of sweeps left has no limit.
-MOST = 4096
+MOST_ATTEMPT_SWEEPS = 4096
 # Bytes of a state that an attempt takes, at most.
 STATE_BYTES = 48
 # The share of the change that the tolerance allows which a component may have left.
@@ -371,10 +371,10 @@ class ComponentSolver:
         return self._left > LEAST_SWEEPS_LEFT and operations(self.mdp, self._left) > WORTH and self._fits
 
     def improve(self, x: np.ndarray, tolerance: float) -> bool:
-        """Settle the components of x (S + 1, W) one after another; return whether that was tried.
+        """Settle the components of x (S + 1, W) one after another. Return whether that was tried.
 
-        An attempt may cost half of the sweeps that seem to be left, and at most `MOST`; after that every remaining
-        component is swept once.
+        An attempt may cost half of the sweeps that seem to be left, and at most `MOST_ATTEMPT_SWEEPS`. After that every
+        remaining component is swept once.
         """
         mdp, self._is_tried = self.mdp, True
         components = mdp.dynamics.components(~np.asarray(mdp.terminal), LEAST_PART if mdp.is_sticky else 1)
@@ -382,7 +382,7 @@ class ComponentSolver:
             return False
         target = COMPONENT_SHARE * tolerance * (1 - mdp.gamma)
         with np.errstate(over="ignore", invalid="ignore"):
-            most = min(0.5 * self._left, MOST) * mdp.num_states
+            most = min(0.5 * self._left, MOST_ATTEMPT_SWEEPS) * mdp.num_states
             mdp.dynamics.settle_components(self.equation, x, components, target, SETTLED, most)
         return True
 

@@ -6,7 +6,7 @@ over policies whose expected sums of positive and of negative rewards are not bo
 1. End components that pay nothing are collapsed: a policy may stay there for ever, so that each becomes one node with
    the choices that leave it, and one more that stops and pays 0. No other way of staying for ever has a finite value:
    whoever stays in a component that pays is paid infinitely often. So policies that end almost surely, *proper* ones,
-   are all that counts; if there is none, there is no finite value.
+   are all that counts. If there is none, there is no finite value.
 2. Policy iteration from a proper policy, in which actions are replaced by those that are better beyond rounding alone.
    If the new policy is not proper, it stays in a component with a positive mean reward, which can be repeated before
    the end as often as one likes: the value is infinite. With T_a v(n) = r(n, a) + sum_m p(m | n, a) v(m), the mean
@@ -81,12 +81,12 @@ class Choices(NamedTuple):
     """Choices of nodes, written out: the choices of node n are the rows rows[n] to rows[n + 1].
 
     Attributes:
-        matrix: (R, M + 1) CSR of the outcomes that leave the node; node M is the end.
+        matrix: (R, M + 1) CSR of the outcomes that leave the node. Node M is the end.
         rows: (M + 1,). owner: (R,) the node of each row.
         rewards: (R,), to be maximised. error: (R,) bound on the error of each, of one that is 0 exactly none.
-        origin: (R,) node of the MDP times its choices, plus the choice; -1: to stop if nothing is paid.
+        origin: (R,) node of the MDP times its choices, plus the choice. -1: to stop if nothing is paid.
         terms: the most outcomes of a row, and the numbers that a probability was computed from.
-        deviation: how far the probabilities of a row may be from its own, in sum; bounds hold for all of them.
+        deviation: how far the probabilities of a row may be from its own, in sum. Bounds hold for all of them.
     """
 
     matrix: "csr_matrix"
@@ -147,7 +147,7 @@ def total_reward(
     """The expected sum of rewards until the end of the best, the worst or a given policy.
 
     Raises:
-        DivergenceError: it is infinite, or there is no policy that has one; the message names a cycle.
+        DivergenceError: it is infinite, or there is no policy that has one. The message names a cycle.
         PrecisionError: floats cannot tell it, or prove no bound within the tolerance.
     """
     goals = _goals(mdp, select, tolerance, progress)
@@ -173,9 +173,9 @@ class WrittenOut(NamedTuple):
     """Nodes of an MDP and the outcomes of their choices.
 
     Attributes:
-        mdp: its nodes are states, under sticky actions pairs (state, previously executed action); N in all.
+        mdp: its nodes are states, under sticky actions pairs (state, previously executed action), N in all.
         sign: -1 if rewards are to be minimised, else 1. per_node: C, choices of a node: A, or 1 under a policy.
-        matrix: (N C, N + 2) CSR, column N: it is over; column N + 1: it is over without having arrived.
+        matrix: (N C, N + 2) CSR. Column N: it is over. Column N + 1: it is over without having arrived.
         rewards: (N C,) means. size: (N C,) means of their absolute values. error: (N C,) bounds.
         live: (N,) bool, nodes of states that are not terminal. arrived: as `GoalProblem.of` takes it.
     """
@@ -235,10 +235,10 @@ class GoalProblem:
     """Nodes of an MDP, their choices, and the same after components that pay nothing are collapsed.
 
     Attributes:
-        choices: of the collapsed nodes. node_of: (N,) the collapsed node of each node; M: it is over.
-        matrix: (N C, N + 1) the outcomes of all C choices of the nodes; column N: it is over.
+        choices: of the collapsed nodes. node_of: (N,) the collapsed node of each node, M if it is over.
+        matrix: (N C, N + 1) the outcomes of all C choices of the nodes. Column N: it is over.
         inside: (N C,) bool, the choices that stay in a collapsed component.
-        staying: (N,) the choices of nodes that stay there for ever; None: any.
+        staying: (N,) the choices of nodes that stay there for ever. None: any.
     """
 
     def __init__(
@@ -291,11 +291,11 @@ class GoalProblem:
         staying: np.ndarray | None = None,
     ) -> "GoalProblem":
         """
-        component: (N,) the component of each node, from 0 on, each of which becomes one node; -1: none.
+        component: (N,) the component of each node, from 0 on, each of which becomes one node, -1 for none.
         inside: (N C,) bool, the choices that stay in a component.
         stops: what staying in the first components pays for ever, to be maximised.
         rewards: (N C,) of the choices. error: (N C,) bounds on the error of each.
-        staying: (N,) the choices of nodes of components that stay; None: any that is inside.
+        staying: (N,) the choices of nodes of components that stay. None: any that is inside.
         """
         from scipy import sparse
 
@@ -333,7 +333,7 @@ class GoalProblem:
         """((N,) values, (N,) error of each, (N,) choices) if `inside` (M + 1,) bool holds, at the end 0, else
         infinite.
 
-        From the nodes inside, the end among them, some policy surely ends without leaving them; choices that may leave
+        From the nodes inside, the end among them, some policy surely ends without leaving them. Choices that may leave
         them are left out.
         """
         choices = self.choices
@@ -360,7 +360,7 @@ class GoalProblem:
         return v[self.node_of[:-2]], error[self.node_of[:-2]], self.unfolded(origin)
 
     def solve(self, tolerance: float, progress: Callable[[int, float], None] | None = None) -> Goals:
-        """Policy iteration, then bounds; in rational numbers if floats cannot tell, or are too short."""
+        """Policy iteration, then bounds, in rational numbers if floats do not decide it, or are too short."""
         choices = self._without_idle(self.choices)
         sure, policy = self.proper(choices)
         if not sure[:-1].all():
@@ -420,7 +420,7 @@ class GoalProblem:
         )
 
     def unfolded(self, origin: np.ndarray) -> np.ndarray:
-        """(N,) choices of the nodes, from the choices of the collapsed nodes (M,); -1 is to stop."""
+        """(N,) choices of the nodes, from the choices of the collapsed nodes (M,). -1 is to stop."""
         nodes = len(self.node_of) - 2
         policy = np.zeros(nodes, np.int64)
         matrix, inside = self.matrix, self.inside
@@ -475,7 +475,7 @@ def _sorted_choices(
 
 
 def recurrent_classes(matrix: "csr_matrix", live: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """((N,) number of the recurrent class of each live node of a Markov chain, -1: none; whether in one).
+    """((N,) number of the recurrent class of each live node of a Markov chain, -1 for none, whether in one).
 
     matrix (N, N + K): the last columns are nodes that are never left, and no live ones.
     """
@@ -554,8 +554,8 @@ def _iterated(
     tolerance: float,
     dtype: type = float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-    """((M,) values, (M,) error of each, (M,) rows, improvements), from a proper policy; `Undecided` if floats, or
-    pairs of them (complex), cannot tell."""
+    """((M,) values, (M,) error of each, (M,) rows, improvements), from a proper policy. `Undecided` if floats, or pairs
+    of them (complex), do not decide it."""
     nodes = np.arange(choices.num_nodes)
     if not len(nodes):
         return np.zeros(0), np.zeros(0), policy, 0
@@ -587,7 +587,7 @@ def _iterated(
 def _errors(
     choices: Choices, policy: np.ndarray, chain: Chain, total: np.ndarray, slack: np.ndarray, tolerance: float
 ) -> np.ndarray:
-    """(M,) the error of a policy's values with residuals `total` (R,), each within `slack`; `Undecided` if unproven."""
+    """(M,) the error of a policy's values with residuals `total` (R,), each within `slack`. `Undecided` if unproven."""
     nodes = np.arange(choices.num_nodes)
     own = choices._replace(
         matrix=choices.matrix[policy], rows=np.arange(len(nodes) + 1), owner=nodes, rewards=choices.rewards[policy]
@@ -602,7 +602,7 @@ def _errors(
 def _room(
     choices: Choices, rows: np.ndarray, chain: Chain, off: np.ndarray, slack: np.ndarray, tolerance: float
 ) -> np.ndarray | None:
-    """(M,) w <= tolerance with w(n) >= off + sum_m p(m) w(m) for all choices (R,), rounding included; None if unproven.
+    """(M,) w <= tolerance with w(n) >= off + sum_m p(m) w(m) for all choices (R,), rounding included. None if unproven.
 
     w is what a policy collects that is paid so much, and its slack more, improved from a proper one (M,) whose chain is
     given. Each row is paid its own rounding, not the rounding of another choice of its node.
@@ -693,7 +693,7 @@ def longest_paths(mdp: TabularMDP, select: Selection) -> Goals:
     """Total rewards if every choice has one outcome: longest paths to the end, or to a cycle that pays nothing.
 
     Rewards are whole multiples of a power of 2, so that all sums are of whole numbers, and no tie is left to rounding.
-    Paths become longer step by step; once the steps of their states form a cycle, it pays: the value is infinite.
+    Paths become longer step by step. Once the steps of their states form a cycle, it pays: the value is infinite.
     """
     sign = -1 if select.kind == "worst" else 1
     table, terminal = np.asarray(mdp.dynamics.deterministic_table()), np.asarray(mdp.terminal)
@@ -741,7 +741,7 @@ FIRST_BOUNDS, ATTEMPT, MOST_SWEEPS, PART = 32, 64, 100_000, 0.25
 def swept_goals(
     mdp: TabularMDP, select: Selection, tolerance: float, progress: Callable[[int, float], None] | None
 ) -> Goals | None:
-    """Total rewards by sweeps, if no component pays nothing and to stay in one always costs; else None.
+    """Total rewards by sweeps, if no component pays nothing and to stay in one always costs, else None.
 
     There T has one fixed point V. Values that a sweep lowers everywhere are no less than V, and those that it raises
     everywhere no more, as long as each backup is rounded up, or down: it pays its rounding more, or less. So values
@@ -796,7 +796,7 @@ def swept_goals(
 def _monotone(
     mdp: TabularMDP, select: Selection, x: np.ndarray, over: np.ndarray, side: float, part: float, step: float
 ) -> tuple[np.ndarray | None, int]:
-    """(values moved by a part to a side, and swept until a sweep moves all of them back; sweeps); None: it does not."""
+    """(values moved by a part to a side, and swept until a sweep moves all of them back, sweeps). None: it does not."""
     from pharos.mdp import Rewards
     from pharos.solvers.fixed_point import Backup
 

@@ -2,16 +2,15 @@
 
 Its result is only a better x to go on sweeping from: the bound of `fixed_point` comes from the next sweep alone.
 Three ways, depending on the operator: a deterministic policy without chance has a functional graph, one pass over it
-gives its values; small systems are solved directly; large ones inexactly, by a Krylov method whose operator is a sweep
-of the policy, so that nothing is stored but some vectors. Source: Howard (1960); Puterman (1994), section 6.4; inexact:
-Gargiani et al. (2024), "Inexact policy iteration methods for large-scale Markov decision processes".
+gives its values. Small systems are solved directly, large ones inexactly, by a Krylov method whose operator is a sweep
+of the policy, so that nothing is stored but some vectors. Source: Howard (1960) and Puterman (1994), section 6.4.
+Inexact: Gargiani et al. (2024), "Inexact policy iteration methods for large-scale Markov decision processes".
 
 Sparse linear systems (1 - gamma P) x = r of a policy, within limits of time and memory: two families of MDPs are slow
 by sweeps near gamma = 1, and each is quick by one of two methods. If states lead to near ones (rings, grids,
-corridors, games of many screens), elimination in the order of Cuthill and McKee fills little in; how much is counted
-beforehand. If any state soon leads anywhere, BiCGSTAB converges within some tens of steps. MDPs with neither
-property are not solved here. Source: Cuthill and McKee (1969); Liu (1990), elimination trees; van der Vorst (1992),
-BiCGSTAB.
+corridors, games of many screens), elimination in the order of Cuthill and McKee fills little in. How much is counted
+beforehand. If any state soon leads anywhere, BiCGSTAB converges within some tens of steps. MDPs with neither property
+are not solved here. Source: Cuthill and McKee (1969); Liu (1990), elimination trees; van der Vorst (1992), BiCGSTAB.
 """
 
 import math
@@ -47,7 +46,7 @@ MOST_ATTEMPT_FILLED, MOST_ATTEMPT_MULTIPLICATIONS = 10_000_000, 5e9
 
 
 def solution_of_system(system: "csr_matrix", right: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """The x of system x = right, from a guess; NaN if the system is singular to the last bit, or takes too long."""
+    """The x of system x = right, from a guess. NaN if the system is singular to the last bit, or takes too long."""
     try:
         if len(right) <= DENSE:
             return np.linalg.solve(system.toarray(), right)
@@ -83,7 +82,7 @@ def _large(system: "csr_matrix", right: np.ndarray, x: np.ndarray) -> np.ndarray
 
 
 def iterated(system: "csr_matrix", right: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """The x of system x = right, by BiCGSTAB, repeated on the residual as far as rounding allows; NaN if divergent."""
+    """The x of system x = right, by BiCGSTAB, repeated on the residual as far as rounding allows. NaN if divergent."""
     residual = right - system @ x
     for call in range(CALLS):
         step, left, _ = bicgstab(lambda y: system @ y, residual, SHRINKAGE, MOST_BICGSTAB_STEPS)
@@ -165,7 +164,7 @@ def fills_little(matrix: "csr_matrix") -> bool:
 FIRST_ATTEMPT, FIRST_INEXACT = 64, 256
 # Nodes times actions of the largest linear system that is solved directly, and nodes of the largest that is tried so
 # at once. (Nodes are states, or pairs with a previous action.)
-MOST_ENTRIES, DIRECTLY = 2_000_000, 3000
+MOST_CHOICES, DIRECTLY = 2_000_000, 3000
 # States whose greedy actions are worked out in one go.
 GREEDY_BLOCK = 1 << 16
 # Improvements of one attempt.
@@ -183,7 +182,7 @@ class PolicyIteration:
     """Policy iteration between sweeps: decides when an attempt pays, by counting operations, and improves values.
 
     Attributes:
-        tick: called between the parts of an attempt, as often as after a few sweeps; it may raise.
+        tick: called between the parts of an attempt, as often as after a few sweeps. It may raise.
     """
 
     def __init__(self, mdp: TabularMDP, select: Selection, tick: Callable[[], object] = bool):
@@ -222,8 +221,8 @@ class PolicyIteration:
     @property
     def is_direct(self) -> bool:
         """Whether linear systems are solved directly: if they are small, or the inexact way has failed twice."""
-        most = MOST_ENTRIES if self._failures > 1 else DIRECTLY
-        return self.nodes <= most and self.nodes * self.mdp.num_actions <= MOST_ENTRIES
+        most = MOST_CHOICES if self._failures > 1 else DIRECTLY
+        return self.nodes <= most and self.nodes * self.mdp.num_actions <= MOST_CHOICES
 
     @property
     def is_chain(self) -> bool:
@@ -283,7 +282,8 @@ class PolicyIteration:
             x[:-1, 0] += step
 
     def _improve_inexactly(self, x: np.ndarray, target: float) -> bool:
-        """Improve x until a sweep changes it by at most the target, or by rounding alone; whether that beats sweeps.
+        """Improve x until a sweep changes it by at most the target, or by rounding alone. Return whether that beats
+        sweeps.
 
         An attempt may cost a third of the sweeps that seem to be left, and more as long as it is ahead of them.
         """
@@ -306,9 +306,9 @@ class PolicyIteration:
         return change < self._change
 
     def _evaluate_roughly(self, x: np.ndarray, policy: PolicyTable) -> float:
-        """Move x (S + 1, W) towards the values of a policy; return the cost, in sweeps.
+        """Move x (S + 1, W) towards the values of a policy. Return the cost, in sweeps.
 
-        One sweep in place is x -> G x + g with the fixed point that is sought; (1 - G) d = G x + g - x is solved for
+        One sweep in place is x -> G x + g with the fixed point that is sought. (1 - G) d = G x + g - x is solved for
         the step d, to a tenth. G y is a sweep from y without rewards.
         """
         mdp = self.mdp
@@ -331,7 +331,7 @@ class PolicyIteration:
         return applications + 2.0
 
     def _greedy(self, x: np.ndarray) -> PolicyTable:
-        """The policy of the best (or worst) actions by x; if a policy is given, that one."""
+        """The policy of the best (or worst) actions by x, or a fixed policy."""
         if isinstance(self.select, PolicyTable):
             return self.select
         mdp, actions = self.mdp, np.empty(self.mdp.num_states, np.int64)
@@ -350,7 +350,7 @@ def without_rewards(rewards: Rewards) -> Rewards:
 
 
 def chain(mdp: TabularMDP, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """((S,) next state, -1 for the end; (S,) reward) of a deterministic policy on a deterministic MDP."""
+    """((S,) next state, -1 for the end, (S,) reward) of a deterministic policy on a deterministic MDP."""
     table, rewards = mdp.dynamics.deterministic_table(), mdp.reward_table
     assert table is not None
     rows = np.arange(mdp.num_states)
@@ -359,13 +359,13 @@ def chain(mdp: TabularMDP, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def chain_values(gamma: float, successor: np.ndarray, reward: np.ndarray) -> tuple[np.ndarray, int]:
-    """((S,) values on a functional graph, in O(S); if gamma is 1 a state on a cycle of infinite value, else -1)."""
+    """((S,) values on a functional graph, in O(S), and if gamma is 1 a state on a cycle of infinite value, else -1)."""
     v = np.empty(len(successor))
     return v, int(bellman.solve_chain(successor, reward, gamma, v, np.empty(len(successor), np.int64)))
 
 
 def linear_values(mdp: TabularMDP, policy: PolicyTable, guess: np.ndarray) -> np.ndarray:
-    """(S, W): the values of a policy, as the solution of (1 - gamma P) x = r; NaN if it is not found."""
+    """(S, W): the values of a policy, as the solution of (1 - gamma P) x = r, NaN if it is not found."""
     from scipy import sparse
 
     states, actions, width = mdp.num_states, mdp.num_actions, mdp.width

@@ -1,9 +1,9 @@
 """Values by several processes: each sweeps a range of the states, and gets the values of its halo from the others.
 
 Each rank has a `Part` (mdp/reachability.py). A sweep goes in place over its own states, from the last to the first,
-with the values that the halo had after the sweep before; messages bring those after it, and a reduction the largest
-change. So every new entry is a backup of entries that are old or already new, which is all that the error bound of
-fixed_point.py asks for: it holds with the largest change of all. Values cross the border of a range once a sweep, so
+with the values that the halo had after the sweep before. Messages bring the values after it, and a reduction the
+largest change. So every new entry is a backup of entries that are old or already new, which is all that the error bound
+of fixed_point.py asks for: it holds with the largest change of all. Values cross the border of a range once a sweep, so
 there are more sweeps than in one process: a Breakout of 2.4 million states takes 33 in one, 38 in two, 55 in four, 111
 in sixteen.
 
@@ -53,7 +53,7 @@ _DIGEST = 32  # characters of a digest; two follow, of the header and of the val
 
 
 class SolverCheckpoint:
-    """File of the values of all ranks, so far; the first rank reads and writes it.
+    """File of the values of all ranks, so far. The first rank reads and writes it.
 
     A file holds the values of one question: its name is a digest of the MDP, of the selection of actions and of
     `question`. It does not depend on the number of ranks, and is removed once the question is answered.
@@ -119,7 +119,7 @@ class SolverCheckpoint:
                 self._path.unlink(missing_ok=True)
 
     def _read(self, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray | None]:
-        """(header, values) of the file; zeros and None if there is none, or not a whole one."""
+        """(header, values) of the file. Zeros and None if there is none, or not a whole one."""
         nothing = np.zeros(_HEADER), None
         assert self._path is not None
         try:
@@ -153,7 +153,7 @@ class RankedBackup:
     """One rank's part of the Bellman backup T of an MDP under a selection of actions.
 
     Attributes:
-        part: the states of this rank. backup: T on them; its factor and its rounding belong to the whole MDP.
+        part: the states of this rank. backup: T on them. Its factor and its rounding belong to the whole MDP.
         x: (n + H + 1, W) values, see mdp/reachability.py. previous: the values before the last sweep of a horizon.
         first: (R, 2) runs of its states that sweeps of a horizon begin with: those that others read, short gaps filled.
     """
@@ -180,7 +180,7 @@ class RankedBackup:
         return self.part.zeros()
 
     def sweep(self) -> float:
-        """Replace the values of this rank's states by their backups, in place; return the largest change.
+        """Replace the values of this rank's states by their backups, in place. Return the largest change.
 
         Messages stay under way until `share`.
         """
@@ -216,7 +216,7 @@ class RankedBackup:
     # Values of all ranks, at the first ------------------------------------------------------------------------------
 
     def gathered(self, x: np.ndarray) -> np.ndarray | None:
-        """(S + 1, W) values of the states of all ranks, at the first rank; None at the others."""
+        """(S + 1, W) values of the states of all ranks, at the first rank, None at the others."""
         is_first = self.rank.rank == 0
         whole = np.zeros((self.mdp.num_states + 1 if is_first else 0, x.shape[1]))
         own = x[: len(self.part)]
@@ -255,7 +255,7 @@ class RankedBackup:
 
 
 def _larger(one: float, other: float) -> float:
-    """The larger of two numbers; NaN if one is NaN."""
+    """The larger of two numbers, NaN if one is NaN."""
     return float(np.maximum(one, other))
 
 
@@ -307,7 +307,7 @@ def ranked_induction(
     checkpoint: SolverCheckpoint,
     progress: Callable[[int, float], None] | None,
 ) -> tuple[float, np.ndarray]:
-    """Compute the values with `horizon` steps to go, in `backup.x`; return (bound, values with one step less)."""
+    """Compute the values with `horizon` steps to go, in `backup.x`. Return (bound, values with one step less)."""
     step = checkpoint.start(backup)
     bound, largest = checkpoint.numbers if step else (0.0, 0.0)
     before = backup.x.copy()
@@ -335,7 +335,7 @@ def shared_solution(
     solving: Solving,
     checkpoint_seconds: float = WRITE_SECONDS,
 ) -> Solution:
-    """Solution of an MDP under a selection of actions, by several processes; under MPI the others get None.
+    """Solution of an MDP under a selection of actions, by several processes. Under MPI the others get None.
 
     Args:
         checkpoint_seconds: between two checkpoints.

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pharos.solvers.goals import Choices
 
 # Entries that all eliminations of one solve may fill in, about a second: the numbers grow, too.
-MOST_ENTRIES = 300_000
+MOST_RATIONAL_ENTRIES = 300_000
 
 Row = tuple[Fraction, dict[int, Fraction]]
 
@@ -31,7 +31,7 @@ def rational_values(
     Raises:
         DivergenceError: from `infinite`. PrecisionError: the nodes are too many.
     """
-    count, entries_left = choices.num_nodes, MOST_ENTRIES
+    count, entries_left = choices.num_nodes, MOST_RATIONAL_ENTRIES
     written = fractions_of(choices)
     if written is None:
         raise _too_many_nodes(count)
@@ -59,9 +59,9 @@ def rational_values(
 
 
 def fractions_of(choices: "Choices") -> list[Row] | None:
-    """The rows as rational numbers, equal to the floats; None if they are too many."""
+    """The rows as rational numbers, equal to the floats. None if they are too many."""
     matrix = choices.matrix
-    if matrix.nnz > MOST_ENTRIES:
+    if matrix.nnz > MOST_RATIONAL_ENTRIES:
         return None
     rows = []
     for i in range(matrix.shape[0]):
@@ -78,15 +78,15 @@ def _divided(reward: Fraction, after: dict[int, Fraction]) -> Row:
 
 
 def exact_sums(after: list[dict[int, Fraction]], b: list[Fraction]) -> list[Fraction] | None:
-    """x = b + P x of n nodes, of rows without what stays, each left almost surely; None if it fills in too much."""
+    """x = b + P x of n nodes, of rows without what stays, each left almost surely. None if it fills in too much."""
     rows = [_divided(*each) for each in zip(b, after, strict=True)]
-    return eliminated(rows, len(b), MOST_ENTRIES)[0]
+    return eliminated(rows, len(b), MOST_RATIONAL_ENTRIES)[0]
 
 
 def best_mean(
     choices: "Choices", rows: list[Row], policy: np.ndarray, class_of: np.ndarray
 ) -> tuple[Fraction, np.ndarray] | None:
-    """(The mean reward of a policy (M,), a better policy or the same one); None if it fills in too much.
+    """(The mean reward of a policy (M,), a better policy or the same one). None if it fills in too much.
 
     Args:
         class_of: (M,) 0 in the only recurrent class of the policy, else -1.
@@ -121,7 +121,7 @@ def _too_many_nodes(count: int) -> PrecisionError:
 
 
 def eliminated(rows: list[Row], count: int, most: int) -> tuple[list[Fraction] | None, int]:
-    """(x = r + P x by elimination without subtraction of probabilities; entries that it filled in).
+    """(x = r + P x by elimination without subtraction of probabilities, entries that it filled in).
 
     x is None if some nodes never end, or if it would fill in more entries than `most`.
     Source: Grassmann, Taksar and Heyman (1985).

@@ -1,7 +1,7 @@
 """Probabilities of reaching a target, and the cost of getting there, of the best and of the worst policy.
 
 A probability is a total reward: a step pays the probability that it enters the target, at which play ends. A cost *that
-must arrive* counts policies that reach the target surely; if none does, the least one is infinite, and if one may
+must arrive* counts policies that reach the target surely. If none does, the least one is infinite, and if one may
 miss it, the largest one is. `goals.py` solves all four.
 """
 
@@ -32,7 +32,7 @@ from pharos.solvers.goals import GoalProblem, table_of_choices, total_reward
 if TYPE_CHECKING:
     from pharos.solvers.goals import Choices
 
-TERMINAL = "terminal"
+TERMINAL_TARGET = "terminal"
 """Name of the target that all terminal states, and the end of an episode without a next state, are."""
 
 
@@ -41,7 +41,7 @@ class StateBounds:
     """Bounds of a number for each state.
 
     Attributes:
-        lower, upper: (S,) float64, proven; both infinite if the number is.
+        lower, upper: (S,) float64, proven. Both infinite if the number is.
     """
 
     lower: np.ndarray
@@ -56,9 +56,9 @@ class Bounds(StateBounds):
     """Bounds of a number for each state, and a policy.
 
     Attributes:
-        lower, upper: (S,) float64, proven; both infinite if the number is.
-        policy: (S,) actions that attain it, or (S, A + 1) under sticky actions, by the previous action; meaningless
-            if the number is infinite.
+        lower, upper: (S,) float64, proven. Both infinite if the number is.
+        policy: (S,) actions that attain it, or (S, A + 1) under sticky actions, by the previous action. Meaningless if
+            the number is infinite.
     """
 
     policy: np.ndarray
@@ -71,7 +71,7 @@ class Reachability:
     Attributes:
         mdp: with gamma 1 and no horizon, whatever was given.
         target: (S,) bool. with_end: whether an episode that ends without a next state counts as arrived.
-        costs: (S, A) >= 0 of executed actions; None: the rewards, as they are or negated.
+        costs: (S, A) >= 0 of executed actions. Default: the rewards, as they are or negated.
         tolerance: the largest error of a number.
 
     Under sticky actions the numbers of a state belong to an episode that starts in it, without a previous action.
@@ -95,7 +95,7 @@ class Reachability:
 
     @cached_property
     def least_cost(self) -> Bounds:
-        """The least expected cost of reaching the target, over policies that surely do; infinite if none does.
+        """The least expected cost of reaching the target, over policies that surely do. Infinite if none does.
 
         Raises:
             ParameterError: costs are needed, as rewards have both signs.
@@ -108,7 +108,7 @@ class Reachability:
 
     @cached_property
     def largest_cost(self) -> Bounds:
-        """The largest expected cost of reaching the target, over all policies; infinite if one may miss it.
+        """The largest expected cost of reaching the target, over all policies. Infinite if one may miss it.
 
         Raises:
             ParameterError: costs are needed, as rewards have both signs.
@@ -170,7 +170,7 @@ class Reachability:
         sign: float,
         end: float = 0.0,
     ) -> Bounds:
-        """Bounds of the states, from values (N,), errors and choices of the nodes; sign -1 negates them.
+        """Bounds of the states, from values (N,), errors and choices of the nodes. sign -1 negates them.
 
         end: the value of an episode that ends without a next state.
         """
@@ -217,7 +217,7 @@ def reach(
     Discount and horizon of the MDP do not count: play goes on until it arrives, or for ever.
 
     Args:
-        target: (S,) bool; or indices of states; or "terminal", every terminal state and the end of an episode; or a
+        target: (S,) bool, or indices of states, or "terminal", every terminal state and the end of an episode. Or a
             label or an expression over the variables of states, such as "x=3 & !done", see `Names.states_where`. What
             there is to name, `names_of(mdp)` says.
         costs: (S, A) numbers >= 0 of executed actions. None: the rewards if none is negative, or those negated if none
@@ -232,9 +232,9 @@ def reach(
             or a variable that is not there.
         PrecisionError: floats, and rational numbers within their limits, do not reach the tolerance.
     Cost: as of total rewards, see `value_iteration`.
-    Source: Baier and Katoen (2008), chapter 10; Haddad and Monmege (2018).
+    Source: Baier and Katoen (2008), chapter 10, and Haddad and Monmege (2018).
     """
-    with_end = isinstance(target, str) and target == TERMINAL
+    with_end = isinstance(target, str) and target == TERMINAL_TARGET
     mask = _target_mask(mdp, target)
     if costs is not None:
         costs = np.asarray(costs, np.float64)
@@ -246,7 +246,7 @@ def reach(
 
 def _target_mask(mdp: TabularMDP, target: ArrayLike | str) -> np.ndarray:
     if isinstance(target, str):
-        if target == TERMINAL:
+        if target == TERMINAL_TARGET:
             return np.array(mdp.terminal)
         return names_of(mdp).states_where(target, mdp.num_states)
     array = np.asarray(target)
@@ -255,7 +255,7 @@ def _target_mask(mdp: TabularMDP, target: ArrayLike | str) -> np.ndarray:
     if array.dtype.kind not in "iu" or array.ndim > 1 or ((array < 0) | (array >= mdp.num_states)).any():
         raise ParameterError(
             f"target is {array.dtype} of shape {array.shape}; expected ({mdp.num_states},) bool, indices of states "
-            f"from 0 to {mdp.num_states - 1}, {TERMINAL!r}, a label or an expression"
+            f"from 0 to {mdp.num_states - 1}, {TERMINAL_TARGET!r}, a label or an expression"
         )
     mask = np.zeros(mdp.num_states, np.bool_)
     mask[array] = True

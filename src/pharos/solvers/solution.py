@@ -24,25 +24,26 @@ class Solving:
 
     Attributes:
         tolerance: largest error of a value, in units of return. It is proven.
-        horizon: number of steps to go, instead of the MDP's own; backward induction then, without keeping the steps.
+        horizon: number of steps to go, instead of the MDP's own. It means backward induction, without keeping the
+            steps.
         keep_all: with a horizon, keep the values of every step as `all_steps`, (T + 1, S), under sticky actions (T + 1,
             S, A): row t has t steps to go.
         progress: called after each sweep with its number and the bound so far, and as often while equations are solved.
-        values: a file (.npy) that holds the values while they are computed, in place of memory, and afterwards; what
-            it holds already is what the sweeps begin with, so that a solve that was killed goes on. Large ones that
-            memory has room for are swept there, and copied to the file every ten minutes and in the end, whatever ends
-            it. None: memory, or, if that has little room, a file without a name.
-        processes: 1; or "mpi": those that `mpiexec` has started, all of which make this call, and sweep a range of the
-            states each; the first gets the Solution, the others None. Values depend on it within the tolerance; those
-            of a horizon do not.
+        values: a file (.npy) that holds the values while they are computed, in place of memory, and afterwards. Sweeps
+            begin with what it holds already, so that a solve that was killed goes on. Large ones that memory has room
+            for are swept there, and copied to the file every ten minutes and in the end, whatever ends it. None:
+            memory, or, if that has little room, a file without a name.
+        processes: 1, or "mpi" for the processes that `mpiexec` has started, all of which make this call, and sweep a
+            range of the states each. The first gets the Solution, the others None. Values depend on it within the
+            tolerance, except with a horizon.
         checkpoint: a folder for the values so far, once a minute, so that the same call goes on after one was killed,
             with any number of processes.
         threads: threads of a sweep. Beyond one, last digits may differ, within the error. They share the states if
             no action is sticky and transitions are in arrays.
-        dtype: type of the stored values: float64; or float32, half the memory, and a bound that counts it. So a
+        dtype: type of the stored values: float64, or float32, half the memory, and a bound that counts it. So a
             tolerance below 1.2e-7 max |V| / (1 - gamma) is out of reach. For one process, and no horizon.
     Raises:
-        ParameterError: an option is out of range; or float32 with a horizon or several processes, a file of values with
+        ParameterError: an option is out of range. Or float32 with a horizon or several processes, a file of values with
             a horizon or several processes, all steps with several processes.
     """
 
@@ -77,7 +78,7 @@ class Solving:
 
     @staticmethod
     def of(mdp: "TabularMDP", tolerance: "float | Solving", options: Mapping[str, Any]) -> "Solving":
-        """The options of solving an MDP: an object, with changes; or of a tolerance. The horizon is the MDP's own if
+        """The options of solving an MDP: an object, with changes, or of a tolerance. The horizon is the MDP's own if
         none is given."""
         options = dict(options) if isinstance(tolerance, Solving) else {"tolerance": tolerance, **options}
         solving = replace(tolerance if isinstance(tolerance, Solving) else Solving(), **options)
@@ -118,16 +119,16 @@ class Solution:
 
     Attributes:
         mdp: what was solved.
-        error_bound: every entry of `v` and `q` is within this of the true value (proven; in units of return). If the
-            probabilities of the MDP were rounded, also of the true value of each MDP within its `residual`; that part
+        error_bound: every entry of `v` and `q` is within this of the true value (proven, in units of return). If the
+            probabilities of the MDP were rounded, also of the true value of each MDP within its `residual`. That part
             may exceed the tolerance.
-        sweeps, seconds: cost of the solve; compiling is not among the seconds.
-        horizon: number of steps to go of the values; or None.
+        sweeps, seconds: cost of the solve. Compiling is not among the seconds.
+        horizon: number of steps to go of the values, or None.
         select: which action is chosen: the best one, the worst one, or the action of a policy.
         x: (S + 1, W) float64, or float32 if it was asked for: values of (state, previously executed action), W = A
-            under sticky actions, else 1; row S, the end, is 0.
+            under sticky actions, else 1. Row S, the end, is 0.
         next_x: the values of next states: x, or with a horizon those with one step less to go.
-        proper: of total rewards, the policy: (S,) actions, or (S, A + 1) if it must look at the previous action; greedy
+        proper: of total rewards, the policy: (S,) actions, or (S, A + 1) if it must look at the previous action. Greedy
             ones may go round in a circle, as every state of it has the same value.
         all_steps: with a horizon, if they were kept: (T + 1, S), or (T + 1, S, A), row t with t steps to go.
 
@@ -159,12 +160,12 @@ class Solution:
 
     @property
     def v(self) -> np.ndarray:
-        """(S,) values; (S, A) under sticky actions."""
+        """(S,) values, (S, A) under sticky actions."""
         return self.mdp.without_width(self.x[:-1])
 
     @property
     def q(self) -> np.ndarray:
-        """(S, A) action values, of choosing; of executing under sticky actions. Computed anew by each call.
+        """(S, A) action values: of choosing, or of executing under sticky actions. Computed anew by each call.
 
         Of actions that are not available -inf (inf in the solution of the worst policy), which no choice takes.
         """
@@ -185,10 +186,11 @@ class Solution:
 
     @cached_property
     def policy(self) -> np.ndarray:
-        """The policy: for "optimal" and "worst" (S,) greedy actions, the first among equals; else the one given.
+        """The policy: for "optimal" and "worst" (S,) greedy actions, the first among equals. Otherwise the policy that
+        was passed.
 
         Of total rewards (gamma 1, no horizon) it ends almost surely, unless it stays in a component in which nothing is
-        paid; under sticky actions that may take (S, A + 1) actions, by the previous action.
+        paid. Under sticky actions that may take (S, A + 1) actions, by the previous action.
         """
         if self.proper is not None:
             return self.proper
@@ -205,7 +207,7 @@ class Solution:
 
     @property
     def given_policy(self) -> np.ndarray | None:
-        """The policy that was evaluated: (S,) actions, (S, A) or (S, A + 1, A) probabilities; else None."""
+        """The policy that was evaluated: (S,) actions, (S, A) or (S, A + 1, A) probabilities. Otherwise None."""
         return getattr(self.select, "table", None)
 
     def optimal_actions(self, tie_tolerance: float = 1e-6) -> np.ndarray:

@@ -69,22 +69,22 @@ def value_iteration(mdp: TabularMDP, tolerance: float | Solving = 1e-6, **option
     of negative rewards are not both infinite. `policy` then reaches the end almost surely, wherever that is optimal.
 
     Args:
-        tolerance: every value is within this of the optimal one, proven; in units of return. With a horizon values are
-            exact up to rounding, whatever the tolerance. Or all options as one `Solving`.
+        tolerance: every value is proven to be within this of the optimal one, in units of return. With a horizon values
+            are exact up to rounding, whatever the tolerance. Or all options as one `Solving`.
         options: other fields of `Solving`: horizon, keep_all, progress, values, processes, checkpoint, threads, dtype.
     Returns:
         A Solution of kind "optimal".
     Raises:
         DivergenceError: gamma is 1, there is no horizon, and from some state the value is infinite or no policy has
-            one; the states and actions of the cycle are named.
+            one. The states and actions of the cycle are named.
         PrecisionError: 64-bit floats cannot reach the tolerance, or hold the values.
-        ParameterError: options that do not go together, see `Solving`; or several processes, and gamma = 1 without a
+        ParameterError: options that do not go together, see `Solving`, or several processes and gamma = 1 without a
             horizon. RankFailed: another rank failed.
-    Cost: O(S A) a sweep, 0.5 to 2 ns for each state and action on game graphs; memory 8 bytes a state (8 A under sticky
+    Cost: O(S A) a sweep, 0.5 to 2 ns for each state and action on game graphs. Memory 8 bytes a state (8 A under sticky
         actions). If gamma is so near 1 that sweeps would be many: strongly connected components one after another
-        if none has half of the states (48 bytes a state); policy iteration, on the graph of the policy if nothing
-        is left to chance (56 bytes a state then); by a Krylov method whose operator is a sweep else (10 vectors
-        of values); and by elimination if that fails and nodes (states, under sticky actions pairs with the previous
+        if none has half of the states (48 bytes a state). Otherwise policy iteration: on the graph of the policy if
+        nothing is left to chance (56 bytes a state then), else by a Krylov method whose operator is a sweep (10 vectors
+        of values), and by elimination if that fails and nodes (states, under sticky actions pairs with the previous
         action) times actions are up to 2 million (up to 500 MB then), or nodes are up to 3000.
     Source: Bellman (1957); in place: Puterman (1994), section 6.3.3; the sticky equation: the pharos paper, appendix A.
     """
@@ -109,7 +109,7 @@ def uniform_value(mdp: TabularMDP, tolerance: float | Solving = 1e-6, **options:
 
 
 def _solution(mdp: TabularMDP, select: Selection, solving: Solving) -> Solution:
-    """Solution under a selection of actions: a fixed point; or by backward induction if there is a horizon."""
+    """Solution under a selection of actions: a fixed point, or by backward induction if there is a horizon."""
     if solving.is_distributed:
         from pharos.solvers.ranked import shared_solution  # which few need
 
@@ -214,15 +214,15 @@ def evaluate_policy(
     tolerance: float | Solving = 1e-6,
     **options: Unpack[SolvingOptions],
 ) -> Solution:
-    """The values of a policy over states; `pharos.evaluate_policy` also takes policies that see observations.
+    """The values of a policy over states. `pharos.evaluate_policy` also takes policies that see observations.
 
     V(s) = sum_a pi(a | s) q(s, a), q(s, a) = r(s, a) + gamma E V(next); chance acts between what the policy chooses and
     what is executed, see `random_actions` and `sticky_actions`.
 
     Args:
-        policy: (S,) integers, an action for each state; or (S, A) probabilities. Under sticky actions also (S, A + 1)
-            integers or (S, A + 1, A) probabilities, for each previously executed action and, last, for none; or a
-            function from an array of state indices to either; or an agent with such a `policy_table()`.
+        policy: (S,) integers, an action for each state, or (S, A) probabilities. Under sticky actions also (S, A + 1)
+            integers or (S, A + 1, A) probabilities, for each previously executed action and, last, for none. Or a
+            function from an array of state indices to either, or an agent with such a `policy_table()`.
         tolerance: every value is within this of the true one, proven. Or all options as one `Solving`.
         options: as `value_iteration` takes them.
     Returns:
@@ -253,7 +253,7 @@ def evaluate_parts(
     Args:
         mdp: disjoint parts without transitions between them, such as copies of one MDP.
         policy: as `evaluate_policy` takes actions, or probabilities.
-        part: (S,) the part of each state, 0 to P - 1; each has states, and as many starts.
+        part: (S,) the part of each state, 0 to P - 1. Each has states, and as many starts.
         start_probabilities: (N,) of the starts of each part.
     Cost: one backward induction of all of them, instead of P.
     """
@@ -285,7 +285,7 @@ def evaluate_parts(
 
 @require_mdp
 def uniform_policy(mdp: TabularMDP) -> np.ndarray:
-    """(S, A) probabilities, all 1 / A; if some actions are not available, 1 over the number of available ones."""
+    """(S, A) probabilities, all 1 / A. If some actions are not available, 1 over the number of available ones."""
     return uniform_choice(mdp)
 
 

@@ -1,7 +1,7 @@
 """Build a state space: enumerate the reachable states of an environment onto disk (Algorithm 1 of the paper, compiled).
 
-Breadth-first search: the array of states, in the order of discovery, is the queue; a table of indices keyed by hash is
-the only other memory (table.py). The search (search.py) expands states and numbers new ones; the journal (journal.py)
+Breadth-first search: the array of states, in the order of discovery, is the queue. A table of indices keyed by hash is
+the only other memory (table.py). The search (search.py) expands states and numbers new ones. The journal (journal.py)
 appends both to files and commits them.
 """
 
@@ -49,26 +49,26 @@ def build(
 
     Args:
         env: the environment, or its name, such as "frozen_lake/4x4".
-        folder: to write to; None for the user's cache, keyed by environment, parameters and rules. A folder that
-            holds the finished state space is loaded; one that holds part of it is resumed, with the same result.
+        folder: to write to. Default: the user's cache, keyed by environment, parameters and rules. A folder that holds
+            the finished state space is loaded. One that holds part of it is resumed, with the same result.
         max_states: StateSpaceTooLarge when there are more.
 
         Cost only (the files are the same, byte for byte):
-        memory: bytes that states and table may take; None for as much as there is. Beyond them the table is on disk, in
+        memory: bytes that states and table may take. Default: as much as there is. Beyond them the table is on disk, in
             a file without a name in `folder` of 23 to 46 bytes a state (11 to 23 more for each further word), which is
             gone in the end.
-        workers: threads, or processes if rules are interpreted; None for all processors.
-        processes: 1; or "mpi": those that `mpiexec` has started, all of which make this call with a folder that all of
-            them see, and share the work and the table of states, which has to fit in memory then (`memory` is for
-            each).
-        progress: None for a bar on a terminal; False for silence; or a function that gets a BuildProgress now and then.
+        workers: threads, or processes if rules are interpreted. Default: all processors.
+        processes: 1, or "mpi" for the processes that `mpiexec` has started, all of which make this call with a folder
+            that all of them see, and share the work and the table of states, which has to fit in memory then (`memory`
+            is for each).
+        progress: None for a bar on a terminal, False for silence, or a function that gets a BuildProgress now and then.
         checkpoint_seconds: at most this much work is lost when the process is killed.
-        wait: if another process is building in the folder, wait for it, with a warning; None: in the user's cache,
-            which nobody has named.
+        wait: if another process is building in the folder, wait for it, with a warning. Default: only in the user's
+            cache, which nobody has named.
     Returns:
         The StateSpace, whose files are in `folder`.
     Raises:
-        StateSpaceTooLarge, DiskFull: what was found is kept; the same command resumes.
+        StateSpaceTooLarge, DiskFull: what was found is kept, and the same command resumes.
         StateSpaceMismatch: the folder holds another environment, or other rules. StateSpaceLocked: somebody else is
         building there, and is not waited for. StateSpaceCorrupted: files were changed. RuleError: a rule failed or left
         the declared ranges, in the state that is named. ParameterError: the folder cannot be used.
@@ -107,7 +107,7 @@ def _build(
     progress: BuildCallback | bool | None,
     hold: Hold,
 ) -> bool:
-    """Complete the state space in the folder; returns whether it was complete before."""
+    """Complete the state space in the folder. Returns whether it was complete before."""
     from pharos.state_space.journal import remove_parts
     from pharos.state_space.ranked_table import RankedSearch
     from pharos.state_space.search import Search, check_max_states, journal_of
@@ -152,7 +152,7 @@ def folder_of(plan: Plan) -> Path:
 
 
 def _manifest_of(plan: Plan, path: Path) -> dict[str, Any] | None:
-    """The manifest of a folder for this state space; None if there is none yet."""
+    """The manifest of a folder for this state space, or None if there is none yet."""
     manifest = read_manifest(path)
     if manifest is None:
         if path.is_dir() and any(not _is_ours(item.name) for item in path.iterdir()):

@@ -25,12 +25,13 @@ from pharos.drawing import ground_of, shape_of
 from pharos.environments import Environment, Layer, State, classes, start_distribution
 from pharos.errors import ParameterError, RuleError, UnknownName
 from pharos.rules import mentioned_names, mutable_attributes, pack_states, unpack_states
-from pharos.state_space.guarded_rules import SUM_TOLERANCE, InterpretedCheck
+from pharos.state_space.guarded_rules import InterpretedCheck
+from pharos.system.arrays import SUM_TOLERANCE
 
 if TYPE_CHECKING:
     from pharos.rules import Rules
 
-RULES = ("transition", "is_terminal", "reward", "draw", "probability", "age", "is_available", "draw_motion")
+CHECKED_RULES = ("transition", "is_terminal", "reward", "draw", "probability", "age", "is_available", "draw_motion")
 
 
 @dataclass(frozen=True)
@@ -69,10 +70,10 @@ def check_environment(env: Environment, *, max_states: int = 1000, seed: int = 0
     same states in the same order, terminal states absorbing.
 
     Args:
-        max_states: how many states are looked at; half of them nearest to the start, half by depth-first search.
+        max_states: how many states are looked at: half of them nearest to the start, half by depth-first search.
         seed: of the order of the depth-first search.
     Returns:
-        a Conformance; print it.
+        a Conformance. Print it.
     Raises:
         RuleError: the first breach found: the rule, the state and the action, what was found and what is expected.
     Cost: about 0.1 ms for each state and action, and a few seconds to compile the rules of a class for the first time.
@@ -98,7 +99,7 @@ def check_environment(env: Environment, *, max_states: int = 1000, seed: int = 0
         _check_built(env, check, states)
         if check.transitions and not _has_choice(check, states):
             notes.append("no policy beats another: at discount 0.99, V* is the value of uniform play")
-    for name in mutable_attributes(env, RULES):
+    for name in mutable_attributes(env, CHECKED_RULES):
         kind = type(getattr(env, name)).__name__
         notes.append(f"rules read {name}, a {kind}, which can change after states were enumerated; expected a tuple")
     _note_unseen_values(env, states, complete, notes)
@@ -222,7 +223,7 @@ def _names_in(value: object) -> tuple[str, ...]:
 
 
 def _check_compiled(env: Environment, check: InterpretedCheck, states: list[State], notes: list[str]) -> bool:
-    """Compare compiled rules with interpreted ones on `states`; False, and a note, if Numba cannot compile them."""
+    """Compare compiled rules with interpreted ones on `states`. False, and a note, if Numba cannot compile them."""
     from pharos.rules import CompiledExpansion, not_compiled, rules_of
 
     rules = rules_of(env)
@@ -420,7 +421,7 @@ def check_declarations(env: Environment) -> None:
         if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < 1:
             raise RuleError(f"{env}: {attribute} is {value!r}; expected an integer of at least 1")
     _ = env.has_chance  # which looks at `outcomes`
-    for rule in RULES:
+    for rule in CHECKED_RULES:
         if "print" in mentioned_names([getattr(cls, rule)], cls):
             raise RuleError(
                 f"{env}: {rule} prints: remove it; rules compute a state, and a compiled one prints no array"
@@ -453,7 +454,7 @@ def check_declarations(env: Environment) -> None:
 
 
 def check_layers(env: Environment, notes: list[str]) -> None:
-    """Raise a RuleError if a layer or the grid breaks the contract; a note if there are no layers."""
+    """Raise a RuleError if a layer or the grid breaks the contract. A note if there are no layers."""
     source = type(env).__name__
     if not isinstance(env.layers, dict) or not all(isinstance(name, str) for name in env.layers):
         raise RuleError(f"{source}.layers is {env.layers!r}; expected a dict of name -> Layer")

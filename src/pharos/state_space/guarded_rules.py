@@ -10,9 +10,7 @@ import numpy as np
 
 from pharos.environments import Environment, Layer, State
 from pharos.errors import RuleError
-
-SUM_TOLERANCE = 1e-9
-"""Largest difference from 1 of the sum of the probabilities of an action's outcomes."""
+from pharos.system.arrays import SUM_TOLERANCE
 
 SAME_ANSWER = "expected the same answer to the same question"
 
@@ -29,7 +27,7 @@ class _ReadOnly(tuple):
 
 
 class _Planes:
-    """Planes that raise when a drawing leaves them; compiled code would write elsewhere, or from the other end."""
+    """Planes that raise when a drawing leaves them. Compiled code would write elsewhere, or from the other end."""
 
     def __init__(self, shape: tuple[int, int, int]):
         self.array = np.zeros(shape, np.uint8)
@@ -50,7 +48,7 @@ class _Planes:
 
 
 class InterpretedCheck:
-    """The rules of an environment, called twice on guarded states; answers are stored."""
+    """The rules of an environment, called twice on guarded states. Answers are stored."""
 
     def __init__(self, env: Environment):
         self.env = env
@@ -65,7 +63,7 @@ class InterpretedCheck:
         self.drawings: dict[State, np.ndarray] = {}
 
     def expand(self, state: State) -> list[State]:
-        """The successors of `state` in the order of actions and outcomes, checked; none if it is terminal."""
+        """The successors of `state` in the order of actions and outcomes, checked. None if it is terminal."""
         self.terminal[state] = self._is_terminal(state)
         if self.terminal[state]:
             return []
@@ -158,7 +156,7 @@ class InterpretedCheck:
         return bool(answers[0])
 
     def _set(self, state: State) -> tuple[bool, ...]:
-        """Whether each action is available in a state; RuleError unless one is."""
+        """Whether each action is available in a state. RuleError unless one is."""
         answers = []
         for action in range(self.env.num_actions):
             where = self.where("is_available", state, action)
@@ -230,7 +228,7 @@ class InterpretedCheck:
         return results[0]
 
     def _checked(self, where: str, out: list) -> State:
-        """`out` as a state: D integers within their ranges; else a RuleError."""
+        """`out` as a state: D integers within their ranges. RuleError if it is none."""
         components = self.components
         if len(out) != len(components):
             raise RuleError(f"{where} leaves {len(out)} components in `out`; expected {len(components)}")

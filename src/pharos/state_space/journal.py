@@ -113,7 +113,7 @@ class Journal:
         self._writer: ThreadPoolExecutor
 
     def open(self, manifest: dict[str, Any] | None) -> Position:
-        """Open the files, at the start states or at the last checkpoint; returns the position of the search."""
+        """Open the files, at the start states or at the last checkpoint. Returns the position of the search."""
         arrays = manifest["arrays"] if manifest else {}
         names = self._names(arrays)
         for name in {*ARRAYS, *PART_NAMES.values()} - set(names):
@@ -164,7 +164,7 @@ class Journal:
             yield
 
     def append(self, states: np.ndarray, block: BranchBlock, position: Position) -> None:
-        """Append in the background, while the next chunk is expanded; at most two chunks wait.
+        """Append in the background, while the next chunk is expanded. At most two chunks wait.
 
         Counts and checksums are noted by the thread that writes, once a chunk is in all files: whatever interrupts the
         main thread, and wherever, a checkpoint finds counts and files that belong together.
@@ -189,7 +189,7 @@ class Journal:
             self._writes.pop(0).result()
 
     def widen(self, position: Position) -> None:
-        """Replace the file of successors by one of 40-bit indices; the old one is deleted once this is committed."""
+        """Replace the file of successors by one of 40-bit indices. The old one is deleted once this is committed."""
         self.finish_writes()
         narrow, self._indices = self._successors_name, SUCCESSORS40
         old = self._files[narrow]
@@ -217,7 +217,7 @@ class Journal:
         """Commit the written data: data first, then the manifest that describes it.
 
         Args:
-            written: entries of the manifest; None for the entries of the thread that writes.
+            written: entries of the manifest. None for the entries of the thread that writes.
         """
         written = written or self._written
         if written is None:
@@ -271,7 +271,7 @@ def number_blocks(file: GrowingFile, dtype: np.dtype, entries: int | None = None
     """Blocks of the numbers in a file: pairs (index of the first one, array), in order.
 
     Args:
-        entries: of a block, at most; None for COPIED_BYTES.
+        entries: of a block, at most. None for COPIED_BYTES.
     """
     size = file.bytes // dtype.itemsize
     block_size = entries or max(1, COPIED_BYTES // dtype.itemsize)
@@ -283,16 +283,16 @@ def number_blocks(file: GrowingFile, dtype: np.dtype, entries: int | None = None
 # Outcomes of a build with chance --------------------------------------------------------------------------------------
 
 
-MOST_PADDING = (3, 10)
+MOST_PADDING_RATIO = (3, 10)
 """The share of (S, A, K) that may be padding, as a fraction."""
 
 ENTRIES = 1 << 18  # of rows of K, as many as are copied at a time
 
 
 class JournalRows(NamedTuple):
-    """Rows of outcomes: number of the first row, number of its first outcome; then R rows of N outcomes in all.
+    """Rows of outcomes: number of the first row, number of its first outcome, then R rows of N outcomes in all.
 
-    counts (R,); codes (R,), None if probabilities are spelled out; successors (N,).
+    counts: (R,). codes: (R,), None if probabilities are spelled out. successors: (N,).
     """
 
     row: int
@@ -309,7 +309,7 @@ class OutcomeParts:
     Attributes:
         folder: that holds them. rows: how many, A for each state. most_declared: the most outcomes that a row may have.
         indices: the file of the finished build that its successors will be in, of INDEX_TYPES.
-        palette: (P, K) uint64, bits of the vectors; None if probabilities are spelled out.
+        palette: (P, K) uint64, bits of the vectors. None if probabilities are spelled out.
     """
 
     folder: Path
@@ -363,7 +363,7 @@ class OutcomeParts:
         return max(int(counts.max()) for _, _, _, counts in self._counts())
 
     def finish(self, written: dict[str, dict[str, Any]]) -> tuple[dict[str, dict[str, Any]], int]:
-        """Write the files of a finished build; returns (entries of the manifest by file name, most outcomes of a row).
+        """Write the files of a finished build. Returns (entries of the manifest by file name, most outcomes of a row).
 
         Args:
             written: entries of the files of the unfinished build.
@@ -372,7 +372,7 @@ class OutcomeParts:
         successors, index_type = self.indices, INDEX_TYPES[self.indices]
         num_entries = written[PART_NAMES[successors]]["bytes"] // dtype_of(index_type).itemsize
         # form of the rows: padded to K, or with offsets; palette and codes, or probabilities
-        is_dense = MOST_PADDING[1] * (self.rows * most - num_entries) <= MOST_PADDING[0] * self.rows * most
+        is_dense = MOST_PADDING_RATIO[1] * (self.rows * most - num_entries) <= MOST_PADDING_RATIO[0] * self.rows * most
         dtypes = {successors: index_type}
         if not is_dense:
             dtypes[OFFSETS] = "<i8"
@@ -444,7 +444,7 @@ def _padded(values: np.ndarray, counts: np.ndarray, most: int, *, fill_with_firs
 
 
 def _link(source: Path, target: Path) -> None:
-    """Give a file another name; copy it if the file system has no hard links."""
+    """Give a file another name. Copy it if the file system has no hard links."""
     if target.is_symlink():
         target.unlink()
     try:
@@ -462,10 +462,10 @@ _SLOTS = 1 << 17  # of the table of the palette: twice as many as codes
 
 
 class OutcomeJournal(Journal):
-    """The files of one build with chance; see `Journal`.
+    """The files of one build with chance, see `Journal`.
 
     Attributes:
-        palette: (capacity, K) uint64, the bits of the vectors found; None if probabilities are spelled out.
+        palette: (capacity, K) uint64, the bits of the vectors found. None if probabilities are spelled out.
     """
 
     def __init__(self, path: Path, plan: Plan):
@@ -493,7 +493,7 @@ class OutcomeJournal(Journal):
         return {**dtypes, PART_NAMES[CODES]: "<u2", PART_NAMES[PALETTE]: "<f8", TERMINAL: "|u1"}
 
     def _check_rules(self, position: Position) -> None:
-        """Load the palette of the build; StateSpaceMismatch if stored outcomes come from other rules."""
+        """Load the palette of the build. StateSpaceMismatch if stored outcomes come from other rules."""
         if self.palette is not None:
             vectors = np.fromfile(self.path / PART_NAMES[PALETTE], "<u8").reshape(-1, self._most)
             self._vectors = len(vectors)
@@ -549,9 +549,9 @@ class OutcomeJournal(Journal):
         self._written = self._entries(at)
 
     def _encoded(self, bits: np.ndarray, counts: np.ndarray) -> np.ndarray | None:
-        """Codes (rows,) uint16 of the rows' probabilities in the palette; None if there are more vectors than codes.
+        """Codes (rows,) uint16 of the rows' probabilities in the palette. None if there are more vectors than codes.
 
-        bits: of the probabilities of all outcomes; counts (rows,): outcomes of each row.
+        bits: of the probabilities of all outcomes. counts: (rows,) outcomes of each row.
         """
         codes = np.empty(len(counts), np.uint16)
         row = first = 0

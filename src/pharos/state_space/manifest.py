@@ -1,7 +1,7 @@
 """The manifest of a state space, and the files that it describes.
 
 A manifest is read, and checked before anything is made of it. `Plan` has the facts of an environment that it needs.
-Files grow by appending, with a checksum for every block; one builder at a time.
+Files grow by appending, with a checksum for every block, and one builder at a time.
 """
 
 import contextlib
@@ -62,7 +62,7 @@ BUILD_AGAIN = "delete the folder and build again"
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """The manifest of a folder; None if there is none.
+    """The manifest of a folder, or None if there is none.
 
     Raises:
         StateSpaceCorrupted: it is nonsense. StateSpaceMismatch: it is of another version of the format.
@@ -266,7 +266,7 @@ def _width(dtype: str) -> int:
 
 
 def _checked_size(name: str, entry: dict[str, Any]) -> int:
-    """Bytes of a file; ValueError unless each block of it has a checksum."""
+    """Bytes of a file. ValueError unless each block of it has a checksum."""
     size = _whole(entry["bytes"], f"bytes of {name}", 0)
     if len(entry["checksums"]) != -(-size // CHECKSUM_BYTES):
         raise ValueError(f"{name}: {len(entry['checksums'])} checksums for {size} bytes")
@@ -274,7 +274,7 @@ def _checked_size(name: str, entry: dict[str, Any]) -> int:
 
 
 def _whole(value: object, name: str, least: int) -> int:
-    """The value; ValueError unless it is a whole number from `least` to 2^63."""
+    """The value. ValueError unless it is a whole number from `least` to 2^63."""
     if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= 2**63:
         raise ValueError(f"{name} is {repr(value)[:200]}; expected a whole number of at least {least}")
     return value
@@ -288,7 +288,8 @@ class Plan:
         env: the environment.
         layout: positions of its components in packed states.
         starts: its start states and their probabilities.
-        identity: the entries of the manifest by which state spaces differ; hashed into the cache's folder names.
+        identity: the entries of the manifest by which state spaces differ. They are hashed into the cache's folder
+            names.
         fingerprint: of its rules.
     """
 
@@ -390,7 +391,7 @@ class GrowingFile:
             )
 
     def append(self, rows: np.ndarray) -> None:
-        """Append the bytes of an array; DiskFull if the disk has no room, and ever after: a file has no gaps."""
+        """Append the bytes of an array. DiskFull if the disk has no room, and ever after: a file has no gaps."""
         if self._failure:
             raise self._failure
         data = np.ascontiguousarray(rows).reshape(-1).view(np.uint8).data
@@ -424,7 +425,7 @@ class GrowingFile:
         return {"bytes": self.bytes, "checksums": self.checksums + partial}
 
     def sync(self) -> None:
-        """Wait until appended data are on the disk; after a failure it always raises: a second try may lie."""
+        """Wait until appended data are on the disk. After a failure it always raises: a second try may lie."""
         if self._unsynced:
             raise self._unsynced
         try:
@@ -448,7 +449,7 @@ def cannot_write(path: Path, error: OSError) -> DiskFull:
 
 
 def lock_build(folder: Path) -> contextlib.AbstractContextManager[None]:
-    """Hold the folder for this process; StateSpaceLocked if another one builds there. See `storage.lock`."""
+    """Hold the folder for this process. StateSpaceLocked if another one builds there. See `storage.lock`."""
     return storage.lock(folder, StateSpaceLocked, "building")
 
 

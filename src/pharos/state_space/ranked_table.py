@@ -6,7 +6,7 @@ states whose hash falls to it (kernels/hash_table.py).
 1. Each rank expands its rows, and asks the owners of the successors for their numbers, with the index of each in the
    block: row x branches + branch, the order in which one process would meet them.
 2. An owner keeps the first of the indices that lead to a new state, and sends it to the rank whose row that is in.
-3. Each rank counts the new states in its rows; with the sum of the ranks before it, they have the numbers that one
+3. Each rank counts the new states in its rows. With the sum of the ranks before it, they have the numbers that one
    process would give them. It sends these to the owners.
 4. Owners answer.
 
@@ -14,7 +14,7 @@ So numbers, and all files, are the same whatever the number of ranks. Rank 0 dis
 
 Rank 0 runs the search and writes the files. While the frontier is narrow (Freeway: 148 thousand levels of 9 states) it
 works alone, as exchanges would cost more than the states. Once it is wide, or the table does not fit, all ranks share
-the table and expand blocks together; the memory for it is then the sum over ranks.
+the table and expand blocks together. The memory for it is then the sum over ranks.
 """
 
 import contextlib
@@ -33,7 +33,7 @@ from pharos.rules import rules_of
 from pharos.state_space.journal import Journal, Position
 from pharos.state_space.manifest import Plan
 from pharos.state_space.progress import BuildCallback
-from pharos.state_space.search import Options, Search
+from pharos.state_space.search import EMPTY_TABLE, Options, Search
 from pharos.state_space.table import BranchBlock, MemoryTable
 from pharos.system.memory import huge_pages
 
@@ -42,7 +42,6 @@ SUPERSTEP_SUCCESSORS = 1 << 20  # of a rank's rows, at most
 _END, _TAKE, _EXPAND = range(3)
 _COUNTS_HEADER = np.zeros(4, np.int64)
 _INT32 = np.dtype(np.int32)
-_NOTHING = np.full(1 << 16, -1, np.int32)  # a table that holds nothing, in which the slot of a state is its bucket
 
 
 def rows_of_rank(plan: Plan) -> int:
@@ -60,8 +59,8 @@ class Owner:
 
     def __init__(self, env: Environment, rank: Rank, num_words: int, most: int, memory: int | None):
         """
-        most: states that a superstep may add. memory: bytes that they may take; None for this rank's part of what there
-        is.
+        most: states that a superstep may add. memory: bytes that they may take. None for this rank's part of what there
+            is.
         """
         self._env, self._rank = env, rank
         if memory is not None:
@@ -71,7 +70,7 @@ class Owner:
         self.count = 0
 
     def claim(self, candidates: np.ndarray, block_indices: np.ndarray) -> np.ndarray:
-        """Entries of candidates; new ones wait for their numbers. `block_indices`: their indices in the block."""
+        """Entries of candidates. New ones wait for their numbers. `block_indices`: their indices in the block."""
         if self.table.is_full(self.count):
             self._grow()
         entries = np.empty(len(candidates), np.int64)
@@ -95,9 +94,9 @@ class Owner:
 
 
 class RankedTable:
-    """One rank's part of the table; all ranks but rank 0 run `answer`, rank 0 calls the other methods.
+    """One rank's part of the table. All ranks but rank 0 run `answer`, rank 0 calls the other methods.
 
-    A header announces each step to the others: (step, first, rows, count); a superstep expands states [first, first +
+    A header announces each step to the others: (step, first, rows, count). A superstep expands states [first, first +
     rows) when `count` are numbered.
     """
 
@@ -121,7 +120,7 @@ class RankedTable:
     # Rank 0 -----------------------------------------------------------------------------------------------------------
 
     def take(self, states: np.ndarray) -> None:
-        """Send states that are numbered already to their owners; state i has number i."""
+        """Send states that are numbered already to their owners. State i has number i."""
         for first in range(0, len(states), len(self._indices)):
             part = np.array(states[first : first + len(self._indices)], np.uint64)
             self._send_header(_TAKE, first, len(part), first)
@@ -134,7 +133,7 @@ class RankedTable:
         """Expand states [first, first + rows), in order, when `count` are numbered.
 
         Returns:
-            (successors int64, terminal, probabilities) of the rows; and the new states, numbered from `count` on.
+            (successors int64, terminal, probabilities) of the rows, and the new states, numbered from `count` on.
         """
         self._send_header(_EXPAND, first, len(states), count)
         cuts = self._cuts(len(states))
@@ -167,7 +166,7 @@ class RankedTable:
     # All --------------------------------------------------------------------------------------------------------------
 
     def _take(self, states: list[np.ndarray], numbers: list[np.ndarray]) -> None:
-        """Exchange numbered states by owner; enter those that this rank owns."""
+        """Exchange numbered states by owner. Enter the states that this rank owns."""
         for keys, number in zip(self.rank.exchange(states), self.rank.exchange(numbers), strict=True):
             for start in range(0, len(keys), self.rows * self.branches):
                 part = slice(start, start + self.rows * self.branches)
@@ -181,7 +180,7 @@ class RankedTable:
     def _superstep(
         self, states: np.ndarray, first: int, cuts: list[int], count: int
     ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
-        """Expand the rows of this rank in a superstep; see the head of this file.
+        """Expand the rows of this rank in a superstep, see the head of this file.
 
         Returns:
             (successors, terminal, probabilities) of the rows, and the new states in them.
@@ -191,7 +190,7 @@ class RankedTable:
         keys, indices = self._keys[:size], self._indices[:size]
         terminal, probabilities = self._terminal[: len(states)], self._probabilities[: len(states)]
         # 1. expand the rows, and send the successors to their owners
-        self.rules.expand_and_find(states, 0, len(states), 0, keys, indices, terminal, probabilities, _NOTHING)
+        self.rules.expand_and_find(states, 0, len(states), 0, keys, indices, terminal, probabilities, EMPTY_TABLE)
         order, counts = self._routed(keys)
         candidates = rank.exchange(self._parts(keys[order], counts))
         block_indices = rank.exchange(self._parts(order + row * branches, counts))
@@ -220,7 +219,7 @@ class RankedTable:
         return (successors.reshape(-1, branches), terminal, probabilities), keys[is_new]
 
     def _routed(self, keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(candidates to look up, sorted by owner; number of each owner's)."""
+        """(candidates to look up, sorted by owner, number of each owner's)."""
         counts = np.empty(self.rank.size, np.int64)
         hash_table.route(keys, self._indices[: len(keys)], self.rank.size, self._order, counts)
         return self._order[: counts.sum()], counts
@@ -246,7 +245,8 @@ def answer(plan: Plan, rank: Rank, memory: int | None) -> None:
 
 @contextlib.contextmanager
 def rank_of_build(plan: Plan, memory: int | None) -> Iterator[Rank]:
-    """Context of this process's rank among those of `mpiexec`; all but rank 0 do their part of the search on entry."""
+    """Context of this process's rank among the ranks of `mpiexec`. All but rank 0 do their part of the search on
+    entry."""
     rank = mpi_rank()
     try:
         if rank.rank > 0:
@@ -267,7 +267,7 @@ WORTH_RANKS = 10_000
 
 
 class RankedSearch(Search):
-    """The search of rank 0; the other ranks run `answer`."""
+    """The search of rank 0. The other ranks run `answer`."""
 
     def __init__(
         self,
@@ -328,7 +328,7 @@ class RankedSearch(Search):
         self._report()
 
     def _distribute_states(self) -> None:
-        """Send the numbered states to their owners; from here on this rank keeps those that wait to be expanded."""
+        """Send the numbered states to their owners. From here on this rank keeps those that wait to be expanded."""
         self.journal.finish_writes()
         self.table.release()
         self._blocks, self._spare, self._ahead = [], [], None
@@ -341,7 +341,7 @@ class Queue:
     """The states that wait to be expanded: in the file up to some number, then in memory.
 
     Attributes:
-        first: the number of the next one; -1 before there is one. stored: states that are read from the file.
+        first: the number of the next one, -1 before there is one. stored: states that are read from the file.
     """
 
     def __init__(self, journal: Journal):

@@ -41,12 +41,12 @@ NARROW_LEVEL_STATES = 2048
 WORTH_FORGETTING = 1 << 16
 FORGETTING_BLOCK = 1 << 18
 # A table that holds nothing, in which the slot of a state is its bucket.
-_NOTHING = np.full(1 << 16, -1, np.int32)
+EMPTY_TABLE = np.full(1 << 16, -1, np.int32)
 
 
 @dataclass(frozen=True)
 class Options:
-    """Arguments of `build` that a search needs; see there."""
+    """Arguments of `build` that a search needs, see there."""
 
     max_states: int | None
     memory: int | None
@@ -90,7 +90,7 @@ class Search:
         self._began = time.perf_counter()
 
     def run(self, manifest: dict[str, Any] | None) -> None:
-        """Search to the end; if that fails, what is in the files is committed, and the same command resumes."""
+        """Search to the end. If that fails, what is in the files is committed, and the same command resumes."""
         try:
             self.position = self.journal.open(manifest)
             self._take_stored_states()
@@ -139,7 +139,7 @@ class Search:
         return self.spilled is None
 
     def _take_stored_states(self) -> None:
-        """Load the states of the last checkpoint; onto disk if memory does not hold them."""
+        """Load the states of the last checkpoint, onto disk if memory does not hold them."""
         stored = self.journal.stored_states(self.position.count)
         if self.table.fits(self.position.count, self.journal.index_dtype):
             self.table.states[: self.position.count] = stored
@@ -178,7 +178,7 @@ class Search:
         self._report()
 
     def _block(self) -> BranchBlock:
-        """Arrays for the rows of a chunk; the journal lets two chunks wait, so the third one back is written."""
+        """Arrays for the rows of a chunk. The journal lets two chunks wait, so the third one back is written."""
         if len(self._blocks) == 3 and self._blocks[0].successors.dtype == self.journal.index_dtype:
             self._blocks.append(self._blocks.pop(0))
         else:
@@ -188,11 +188,11 @@ class Search:
         return self._blocks[-1]
 
     def _probabilities(self, rows: int) -> np.ndarray:
-        """Array for the probabilities of the branches of some states; no rows without chance."""
+        """Array for the probabilities of the branches of some states. No rows without chance."""
         return np.empty((rows if self.env.has_chance else 0, self.branches))
 
     def _expand_narrow(self, block: BranchBlock, base: int, last: int) -> None:
-        """Expand by one thread; with several threads it looks at the width of the frontier again after a while."""
+        """Expand by one thread. With several threads it looks at the width of the frontier again after a while."""
         position, table = self.position, self.table
         stop = min(last, max(position.first + NARROW_LEVEL_STATES, position.count)) if self.threads > 1 else last
         progress = position.progress()
@@ -249,7 +249,7 @@ class Search:
         return Piece(keys, np.empty(len(keys), np.int64), np.empty(rows, np.uint8), self._probabilities(rows))
 
     def _grow_table(self, pool: ThreadPoolExecutor) -> None:
-        """Grow the table; on disk if memory is not enough."""
+        """Grow the table, on disk if memory is not enough."""
         count, dtype, parts = self.position.count, self.journal.index_dtype, self._reachable_states()
         if self.table.fits(count, dtype, 0 if parts is None else count - sum(map(len, parts))):
             self.table.grow(count, dtype, pool, self.workers, parts)
@@ -257,7 +257,7 @@ class Search:
             self._spill()
 
     def _reachable_states(self) -> list[np.ndarray] | None:
-        """Parts of the states that successors may still be, if the class has an age; None: all states.
+        """Parts of the states that successors may still be, if the class has an age. None: all states.
 
         Those are the states older than the youngest one that waits to be expanded.
         """
@@ -350,10 +350,10 @@ class Search:
     def _expand_rows(
         self, pool: ThreadPoolExecutor, states: np.ndarray, keys: np.ndarray, indices: np.ndarray, block: BranchBlock
     ) -> None:
-        """Write the successors of states to keys; to indices -1 - bucket, or in terminal states their own row."""
+        """Write the successors of states to keys, to indices -1 - bucket, or in terminal states their own row."""
         threads = self.threads if len(states) >= WIDE_FOR_THREADS else 1
         cuts = [len(states) * i // threads for i in range(threads + 1)]
-        arrays = (0, keys, indices, block.terminal, block.probabilities, _NOTHING)
+        arrays = (0, keys, indices, block.terminal, block.probabilities, EMPTY_TABLE)
         if threads == 1:
             self.rules.expand_and_find(states, 0, len(states), *arrays)
             return

@@ -65,13 +65,13 @@ class StateSpace:
     States are numbered in the order in which breadth-first search finds them: start states first.
 
     Attributes:
-        environment: the environment, with its parameters; None for a folder whose class pharos does not know.
+        environment: the environment, with its parameters. None for a folder whose class pharos does not know.
         folder: of the files.
         num_states, num_actions, num_terminal_states, depth: S, A, terminal states, largest distance from the start
             states.
         has_chance: whether actions have several outcomes, which `outcomes` has in place of `successors`.
-        successors: (S, A) int32 (`PackedIndices` beyond 2^31 states), index of the next state; terminal states lead
-            to themselves.
+        successors: (S, A) int32 (`PackedIndices` beyond 2^31 states), index of the next state. Terminal states lead to
+            themselves.
         packed_states: (S, W) uint64, see docs/format.md.
         start_states, start_probabilities: indices and probabilities of the start states.
     """
@@ -101,7 +101,8 @@ class StateSpace:
 
     @cached_property
     def successors(self) -> Indices:
-        """Next states (S, A) int32, or, beyond 2^31 states, `PackedIndices` of five bytes each; a read-only memory map.
+        """Next states (S, A) int32, or, beyond 2^31 states, `PackedIndices` of five bytes each, in a read-only memory
+        map.
 
         Raises:
             StateSpaceCorrupted: one is no state, or a terminal state does not lead to itself. The first access looks at
@@ -223,14 +224,14 @@ class StateSpace:
         return bool(self.terminal_bits[i // 8] >> (i % 8) & 1)
 
     def index(self, state: Sequence[int]) -> int:
-        """The number of a state; ParameterError if it is not reachable.
+        """The number of a state. ParameterError if it is not reachable.
 
         The first call indexes all states, in O(S).
         """
         return int(self.indices(np.array([tuple(state)]))[0])
 
     def indices(self, states: np.ndarray) -> np.ndarray:
-        """Numbers (N,) int64 of states (N, D); ParameterError if one is not reachable."""
+        """Numbers (N,) int64 of states (N, D). ParameterError if one is not reachable."""
         from pharos.kernels.hash_table import find_states
 
         states = np.asarray(states)
@@ -271,7 +272,7 @@ class StateSpace:
 
         Args:
             gamma: discount, in [0, 1].
-            rewards: None for the environment's own, computed from the stored transitions; an (S, A) array; or a
+            rewards: None for the environment's own, computed from the stored transitions, an (S, A) array, or a
                 function reward(self, state, action, next_state) in place of the environment's.
             by_range: compute the environment's own rewards when they are asked for, so that a rank of many computes
                 the rewards of its range alone.
@@ -279,7 +280,7 @@ class StateSpace:
         Raises:
             ParameterError: a transition leads to a state that is not older, or a state that is not terminal has no
                 available action.
-        Cost: the rewards of all S A transitions, 20 to 50 ns each on one core; nothing is built again.
+        Cost: the rewards of all S A transitions, 20 to 50 ns each on one core. Nothing is built again.
         """
         from pharos.mdp import (
             Residual,
@@ -316,7 +317,7 @@ class StateSpace:
 
     @cached_property
     def available(self) -> np.ndarray | None:
-        """(S, A) bool, the actions that exist in each state; None if all do everywhere.
+        """(S, A) bool, the actions that exist in each state. None if all do everywhere.
 
         Cost: the rule `is_available` for each state and action.
         """
@@ -329,7 +330,7 @@ class StateSpace:
         return None if sets.all() else sets
 
     def verify(self) -> None:
-        """Read every file once and compare it with its checksums; StateSpaceCorrupted if one differs."""
+        """Read every file once and compare it with its checksums. StateSpaceCorrupted if one differs."""
         for name, entry in self.manifest["arrays"].items():
             blocks = byte_blocks(file_parts(self.folder, self.manifest, name), CHECKSUM_BYTES)
             for number, (expected, block) in enumerate(
@@ -358,11 +359,11 @@ def load(folder: str | os.PathLike, *, verify: bool = True, environment: Environ
 
     Args:
         folder: of the state space.
-        verify: compare every file with its checksums (one read of the files, several GB/s); False trusts their lengths.
-        environment: whose state space it is; None for what the manifest says, if pharos knows its class.
+        verify: compare every file with its checksums (one read of the files, several GB/s). False trusts their lengths.
+        environment: of the state space. Default: what the manifest says, if pharos knows its class.
     Raises:
-        StateSpaceError: there is no state space; StateSpaceIncomplete: its build did not finish; StateSpaceCorrupted: a
-        file is missing, truncated or changed; StateSpaceMismatch: the rules of the environment are not those it was
+        StateSpaceError: there is no state space. StateSpaceIncomplete: its build did not finish. StateSpaceCorrupted: a
+            file is missing, truncated or changed. StateSpaceMismatch: the rules of the environment are not those it was
         built with.
     """
     folder = Path(folder)

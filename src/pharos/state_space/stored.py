@@ -1,10 +1,10 @@
 """The files of a finished state space: mapped, and checked for consistent content.
 
-States and successors must be in their ranges, and agree with the rules; likewise the outcomes of an environment with
+States and successors must be in their ranges, and agree with the rules, and so must the outcomes of an environment with
 chance.
 
-Shards: the files of a state space as ranges in several folders, which an earlier pharos wrote; they are read on. The
-folder of the space has its manifest and `shards.json`, a list of folders. Each of these has a range of every file,
+Shards: the files of a state space as ranges in several folders, which an earlier pharos wrote. They can still be read.
+The folder of the space has its manifest and `shards.json`, a list of folders. Each of these has a range of every file,
 under the file's own name, and `shard.json`: the digest of the manifest, the shard's number and the count. Ranges begin
 at multiples of 1 MiB, so that they can be mapped side by side as the one array that they are.
 """
@@ -51,7 +51,7 @@ _FIXED, _SHARED, _READ = 0x10, 0x01, 0x01  # MAP_FIXED, MAP_SHARED, PROT_READ
 
 
 def check_files(folder: Path, manifest: dict[str, Any]) -> None:
-    """Raise StateSpaceCorrupted if a file is missing, or shorter than committed; of shards see `file_parts`."""
+    """Raise StateSpaceCorrupted if a file is missing, or shorter than committed. For shards see `file_parts`."""
     if not (folder / SHARDS).exists():
         return check_lengths(folder, manifest)
     for name in manifest["arrays"]:
@@ -218,7 +218,7 @@ def check_successors(path: Path, successors: Indices, terminal_bits: np.ndarray,
 
 
 def _check_range(path: Path, block: np.ndarray, num_states: int, numbers: Sequence[int] | np.ndarray) -> None:
-    """Raise StateSpaceCorrupted if an index is no state; `numbers`: the states whose rows are in the block."""
+    """Raise StateSpaceCorrupted if an index is no state. `numbers`: the states whose rows are in the block."""
     if block.min() < 0 or block.max() >= num_states:
         row, action = map(int, np.argwhere((block < 0) | (block >= num_states))[0])
         raise StateSpaceCorrupted(
@@ -249,7 +249,7 @@ def check_states(path: Path, layout: Layout, states: np.ndarray) -> None:
 
 
 def stored_outcomes(folder: Path, manifest: dict[str, Any]) -> OutcomeRows:
-    """The arrays of outcomes of a folder, as memory maps; nothing is read yet."""
+    """The arrays of outcomes of a folder, as memory maps. Nothing is read yet."""
     arrays, successors = manifest["arrays"], successors_name(manifest["arrays"])
     pairs = manifest["num_states"], manifest["num_actions"]
     of_outcomes = (manifest["num_transitions"],) if OFFSETS in arrays else (*pairs, manifest["num_outcomes"])
@@ -309,7 +309,7 @@ def _corrupted(folder: Path, manifest: dict[str, Any], error: WrongOutcomes) -> 
 def outcomes_to_check(
     folder: Path, manifest: dict[str, Any], stored: OutcomeRows, states: np.ndarray
 ) -> dict[int, OutcomesOfState]:
-    """Outcomes of some states, from arrays that are not checked yet; StateSpaceCorrupted if they are none."""
+    """Outcomes of some states, from arrays that are not checked yet. StateSpaceCorrupted if they are none."""
     shape = manifest["num_states"], manifest["num_actions"]
     try:
         check = OutcomeCheck(stored, shape, manifest["num_outcomes"], 0)

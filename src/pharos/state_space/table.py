@@ -49,7 +49,7 @@ class MemoryTable:
 
     Attributes:
         states: (capacity, W) uint64, in the order of discovery.
-        slots: index of a state, or -1; see kernels/hash_table.py.
+        slots: index of a state, or -1, see kernels/hash_table.py.
         forgotten: number of states that the table leaves out, as the search does not come to them again.
     """
 
@@ -57,7 +57,7 @@ class MemoryTable:
         """
         Args:
             margin: states that a kernel may add between two looks at the room.
-            memory: bytes that states and table may take; None for as much as there is.
+            memory: bytes that states and table may take. None for as much as there is.
             share: how many processes share what there is.
         """
         self.states = reserved_states(num_words)
@@ -81,7 +81,7 @@ class MemoryTable:
         return count + self._margin <= len(self.states) and self._size_for(count, dtype, forgotten) is not None
 
     def _size_for(self, count: int, dtype: np.dtype, forgotten: int) -> tuple[int, float] | None:
-        """(slots, share of them that may be used) of a larger table; None if it would hold hardly more states.
+        """(slots, share of them that may be used) of a larger table. None if it would hold hardly more states.
 
         It has room for about twice as many states, or is fuller and as large as memory allows.
         """
@@ -95,7 +95,7 @@ class MemoryTable:
         return (slots, FULLEST) if enough else None
 
     def _limit(self, count: int) -> int:
-        """Bytes for table and states: those asked for; or the free ones, and those that they have already."""
+        """Bytes for table and states: as asked for, or the free ones and those that they have already."""
         if self._memory is not None:
             return self._memory
         return machine.available_memory() // self._share + self.slots.nbytes + count * self.states.shape[1] * 8
@@ -110,7 +110,7 @@ class MemoryTable:
     ) -> None:
         """Replace the table by a larger one, see `fits`, filled from the array of states.
 
-        parts: indices of the only states that are wanted, part by part; None: all.
+        parts: indices of the only states that are wanted, part by part. None: all.
         """
         self.forgotten = 0 if parts is None else count - sum(map(len, parts))
         size = self._size_for(count, dtype, self.forgotten) or (self._slots_for(count - self.forgotten), LOAD)
@@ -153,7 +153,7 @@ class MemoryTable:
         Args:
             keys: (rows * B, W) uint64, successors by B branches. indices: (rows * B,), their indices, or -1 - slot from
                 which to search on.
-            successors: (rows, B), gets the indices. progress: see kernels/hash_table.py; goes on by these rows.
+            successors: (rows, B), gets the indices. progress: see kernels/hash_table.py. It goes on by these rows.
         """
         insert_missing(self.slots, self.states, keys, indices, successors, progress)
 
@@ -177,9 +177,9 @@ class SpilledTable:
     """The table on disk, and memory for a chunk of the frontier.
 
     Attributes:
-        rows: of a chunk: as many as half of the memory holds; the table takes a quarter at a time.
+        rows: of a chunk: as many as half of the memory holds. The table takes a quarter at a time.
         states: those that the chunk numbers and that are not in the file yet. keys, indices: of its candidates.
-        appended: states that are in the file; the first of `states` has this number.
+        appended: states that are in the file. The first of `states` has this number.
     """
 
     def __init__(self, path: Path, num_words: int, branches: int, memory: int, count: int, has_chance: bool = False):
@@ -212,7 +212,7 @@ class SpilledTable:
     def find_or_number(
         self, keys: np.ndarray, indices: np.ndarray, successors: np.ndarray, progress: np.ndarray
     ) -> None:
-        """Number the successors that are new, in their order; see `MemoryTable.find_or_number`.
+        """Number the successors that are new, in their order, see `MemoryTable.find_or_number`.
 
         indices: -1 - bucket, or the own row of a terminal state.
         """
@@ -291,7 +291,7 @@ class DiskTable:
         self._sweep(len(old), lambda low, high: kernels.place_again(self.entries, old, low, high), also=mapping)
 
     def look_up(self, keys: np.ndarray, indices: np.ndarray, first: int, order: np.ndarray, slots: np.ndarray) -> int:
-        """Find candidates, or enter them as new; returns how many of `order` were looked up."""
+        """Find candidates, or enter them as new. Returns how many of `order` were looked up."""
         size = kernels.sort_by_bucket(indices, first, order)
         self._sweep(size, lambda low, high: kernels.look_up(self.entries, keys, order, low, high, indices, slots))
         return size
@@ -301,7 +301,7 @@ class DiskTable:
         self._sweep(size, lambda low, high: kernels.assign_numbers(self.entries, order, low, high, indices, slots))
 
     def _sweep(self, size: int, work: Callable[[int, int], None], also: mmap.mmap | None = None) -> None:
-        """Call work(low, high) for parts of range(size), in order of slots; a part touches no more than the window."""
+        """Call work(low, high) for parts of range(size), in order of slots. A part touches no more than the window."""
         entry_bytes = min(_AROUND, self.entries.nbytes // max(size, 1) + 64)  # bytes that an entry may touch
         step = max(1, self.window // entry_bytes)
         for low in range(0, size, step):
@@ -315,7 +315,7 @@ class DiskTable:
 
 
 def _release_pages(mapping: mmap.mmap) -> None:
-    """Release the pages of the file from this process's memory; they are written when the system sees fit."""
+    """Release the pages of the file from this process's memory. They are written when the system sees fit."""
     if hasattr(mmap, "MADV_DONTNEED"):
         with contextlib.suppress(OSError):
             mapping.madvise(mmap.MADV_DONTNEED)

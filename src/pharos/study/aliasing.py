@@ -30,7 +30,7 @@ def aliasing_table(
     num_states: Mapping[str, float],
     progress: Callable[[str], None] | None = None,
 ) -> "pd.DataFrame":
-    """Aliasing of every instance and observation of a study with at most MOST_STATES states; kept in the folder
+    """Aliasing of every instance and observation of a study with at most MOST_STATES states, kept in the folder
     `aliasing`.
 
     Args:
@@ -59,8 +59,8 @@ def aliasing_table(
 
 
 def with_aliasing(cells: "pd.DataFrame", counts: "pd.DataFrame") -> "pd.DataFrame":
-    """Cells with `aliasing` beside their regret: the share of states whose observation another state has; NaN if it
-    was not counted, 0 for the number of the state.
+    """Cells with `aliasing` beside their regret: the share of states whose observation another state has. NaN if it was
+    not counted, 0 for the number of the state.
     """
     shares = counts[["environment", "instance", "observation", "share"]].rename(columns={"share": "aliasing"})
     joined = cells.merge(shares.astype({"aliasing": float}), on=["environment", "instance", "observation"], how="left")

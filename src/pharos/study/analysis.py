@@ -1,4 +1,4 @@
-"""Statistics of a study: intervals, linear models, correlation of agents; and their comparison with the paper.
+"""Statistics of a study: intervals, linear models, correlation of agents, and their comparison with the paper.
 
 Numbers that the paper printed, as tables: the returns of its appendix C and the fits of its section 4.3.
 """
@@ -15,7 +15,7 @@ from pharos.errors import ParameterError
 from pharos.statistics import bootstrap_interval, interquartile_mean, mean_of_means
 from pharos.study.blocks import Run
 from pharos.study.regression import (
-    MEASURES,
+    MODEL_MEASURES,
     Fit,
     aggregate_r_squared,
     fit,
@@ -42,10 +42,10 @@ class Models:
         regret: the column that is explained.
         fits: those that there are enough rows for.
         notes: one line for whatever was left out, and why.
-        representation_r_squared, class_r_squared: of the fits together; None without them.
-        leave_one_class_out: R2 for classes that the model has not seen; None if there are fewer than two,
+        representation_r_squared, class_r_squared: of the fits together, or None without them.
+        leave_one_class_out: R2 for classes that the model has not seen. None if there are fewer than two,
             or no single model.
-        class_alone: R2 of the single model without the measures: class and representation alone; None without a model.
+        class_alone: R2 of the single model without the measures: class and representation alone. None without a model.
         agent: whose regret it is.
     """
 
@@ -59,21 +59,25 @@ class Models:
     agent: str = PAPER_AGENT
 
     def suffix(self, first: str) -> str:
-        """Ending of the names of this agent's files; empty for the first agent of a study."""
+        """Ending of the names of this agent's files, empty for the first agent of a study."""
         return "" if self.agent == first else "_" + "".join(c if c.isalnum() else "_" for c in self.agent)
 
     def get(self, model: str, subset: str) -> Fit | None:
-        """The fit of a model to a subset of the rows; None if there is none."""
+        """The fit of a model to a subset of the rows, or None if there is none."""
         return next((one for one in self.fits if (one.model, one.subset) == (model, subset)), None)
 
 
 def models(
-    cells: "pd.DataFrame", *, agent: str = "dqn", regret: str = "cumulative_regret", measures: Sequence[str] = MEASURES
+    cells: "pd.DataFrame",
+    *,
+    agent: str = "dqn",
+    regret: str = "cumulative_regret",
+    measures: Sequence[str] = MODEL_MEASURES,
 ) -> Models:
-    """Fit the models to the cells of one agent: the single one, one a representation, one a class; as far as there are
+    """Fit the models to the cells of one agent: the single one, one a representation, one a class, as far as there are
     rows.
 
-    Rows without one of the measures are left out; measures that no row has are left out of the models. Both are noted.
+    Rows without one of the measures are left out. Measures that no row has are left out of the models. Both are noted.
     """
     notes: list[str] = []
     rows = cells[(cells["agent"] == agent) & (cells["observation"] != TABULAR_OBSERVATION)]
@@ -120,7 +124,7 @@ def _pooled_r_squared(fits: Sequence[Fit], model: str) -> float | None:
 def intervals(rows: "pd.DataFrame", *, resamples: int = 1000) -> "pd.DataFrame":
     """Interquartile mean of the normalised regret for each class, agent and observation, with 95 % bootstrap interval.
 
-    Runs are resampled within each task (instance and chance), as Agarwal et al. (2021) do; NaN if a task has one run.
+    Runs are resampled within each task (instance and chance), as Agarwal et al. (2021) do. NaN if a task has one run.
     """
     import pandas as pd
 
@@ -143,12 +147,12 @@ def intervals(rows: "pd.DataFrame", *, resamples: int = 1000) -> "pd.DataFrame":
 def mean_curve(
     tasks: Sequence[np.ndarray], *, resamples: int = 500, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean over tasks of the mean over runs, and the ends of its 95 % interval; runs are resampled within each task.
+    """Mean over tasks of the mean over runs, and the ends of its 95 % interval. Runs are resampled within each task.
 
     Args:
         tasks: for each task an array (runs, T).
     Returns:
-        mean, lower, upper: (T,) each; both ends NaN if a task has one run.
+        mean, lower, upper: (T,) each, with both ends NaN if a task has one run.
     """
     curves = [np.asarray(task).T for task in tasks]
     lower, upper = bootstrap_interval(curves, mean_of_means, resamples=resamples, seed=seed)
@@ -156,7 +160,7 @@ def mean_curve(
 
 
 def agreement(cells: "pd.DataFrame", value: str, agents: tuple[str, str] = ("dqn", "ppo")) -> tuple[float, int] | None:
-    """Pearson correlation of two agents over the cells that both have, and how many these are; None for fewer than
+    """Pearson correlation of two agents over the cells that both have, and how many these are. None for fewer than
     three."""
     wide = cells.pivot_table(index=["instance", "chance", "observation"], columns="agent", values=value)
     if not set(agents) <= set(wide.columns):
@@ -192,7 +196,7 @@ class PaperComparison:
 
 
 def compare(cells: "pd.DataFrame", runs: Sequence[Run], models: Sequence[Models]) -> PaperComparison:
-    """Comparison of each number that the paper prints with ours; NaN if the study has none."""
+    """Comparison of each number that the paper prints with ours, NaN if the study has none."""
     numbers = {run.instance: paper_instance(run.config["environment"], run.config["parameters"]) for run in runs}
     ours: dict[tuple, tuple[float, ...]] = {}
     for row in cells.to_dict("records"):

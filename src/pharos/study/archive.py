@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 ARCHIVE_FORMAT = 1
-CURVE_COLUMNS = ("step",)
+STEP_COLUMNS = ("step",)
 _STUDY, _FORMAT_KEYS, _DIGESTS = b"pharos.study", b"pharos.format", b"pharos.digests"
 _FETCH_AGAIN = "fetch or pack it again"
 EARLIER_HYPERPARAMETERS = {
@@ -49,15 +49,15 @@ here what they were, so that studies which were packed before can be read."""
 
 
 def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str | os.PathLike) -> int:
-    """Write the finished runs of a study into one Parquet file; return how many.
+    """Write the finished runs of a study into one Parquet file, and return how many.
 
     A row for each run: `id`; `record`, its run.json; and for each column of the curve a list. Among the metadata of
     the file are the specification, its digest, and a digest of each run. What agents learnt stays in the folder: some
-    hundred kilobytes a run; a row takes two. Files of code are named relative to the specification, or by their
-    name alone if they are elsewhere, with their checksums; no path of this machine is stored.
+    hundred kilobytes a run, while a row takes two. Files of code are named relative to the specification, or by their
+    name alone if they are elsewhere, with their checksums. No path of this machine is stored.
 
     Raises:
-        ParameterError: no run is finished. OSError: the file cannot be written; an older one then stays as it was.
+        ParameterError: no run is finished. OSError: the file cannot be written. An older one then stays as it was.
     """
     import pyarrow as pa
 
@@ -68,7 +68,7 @@ def pack(source: Source, folder: str | os.PathLike | None = None, *, file: str |
         if record is not None and record["status"] == _worker.FINISHED:
             ids.append(run.id)
             records.append(json.dumps(_placeless(record, study.folder)))
-            curves.append(training.read_curve_table(directory / "runs" / run.id, CURVE_COLUMNS))
+            curves.append(training.read_curve_table(directory / "runs" / run.id, STEP_COLUMNS))
     if not ids:
         raise ParameterError(f"{directory}: no run of {study.name!r} is finished; execute `pharos study run` first")
     columns: dict[str, Any] = {"id": pa.array(ids), "record": pa.array(records)}
@@ -115,10 +115,10 @@ def unpack(
 
     Args:
         file: written by `pack`.
-        folder: of the study; studies/NAME in the current directory when not given. Runs that it has stay as they are.
-        into: another study, which gets the runs that it has as well; None: the packed one, with the defaults
+        folder: of the study. Default: studies/NAME in the current directory. Runs that it has stay as they are.
+        into: another study, which gets the runs that it has as well. Default: the packed one, with the defaults
             of hyperparameters that it was packed with.
-        trust: whether code that the packed study names may be imported, from beside the file; `into` is read in its
+        trust: whether code that the packed study names may be imported, from beside the file. `into` is read in its
             place.
     Returns:
         The folder, and how many runs were added.
@@ -145,7 +145,7 @@ def unpack(
 
 
 def _read(file: Path) -> tuple[str, "pa.Table", dict[str, Any] | None]:
-    """The study in YAML, its runs, and the digests of both; None in place of digests if an older version packed
+    """The study in YAML, its runs, and the digests of both, with None in place of digests if an older version packed
     it."""
     if not file.exists():
         raise ParameterError(f"{file}: no such file")
@@ -212,7 +212,7 @@ def _curve(file: Path, id: str, row: dict[str, list | None], schema: "pa.Schema"
 
     columns = {name: values for name, values in row.items() if values is not None}
     try:
-        if not set(CURVE_COLUMNS) <= set(columns) or len({len(values) for values in columns.values()}) != 1:
+        if not set(STEP_COLUMNS) <= set(columns) or len({len(values) for values in columns.values()}) != 1:
             raise ValueError("its columns differ in length, or have no steps")
         return pa.table(
             {name: pa.array(values, schema.field(name).type.value_type) for name, values in columns.items()}
@@ -222,7 +222,7 @@ def _curve(file: Path, id: str, row: dict[str, list | None], schema: "pa.Schema"
 
 
 def _write(directory: Path, id: str, record: dict[str, Any], curve: "pa.Table") -> bool:
-    """Write a run into the folder; False if a finished one is there already, which stays."""
+    """Write a run into the folder. False if a finished one is there already, which stays."""
     target = directory / "partial" / id
     storage.remove_leftovers(target)
     if _worker.read_status(directory / "runs" / id) == _worker.FINISHED:

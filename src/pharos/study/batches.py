@@ -1,11 +1,11 @@
 """Runs of a study that are trained as one program: which fit together, what trains them, and the values they share.
 
-A run belongs to a batch if the study says `engine: batched`. Batches are formed when a worker is free, from the
-runs that are missing then; a run does not depend on its batch, so neither do results. While a batch is trained, its
-checkpoints are in DIR/batches; a batch that was killed goes on from there with the runs that it had.
+A run belongs to a batch if the study says `engine: batched`. Batches are formed when a worker is free, from the runs
+that are missing then. A run does not depend on its batch, so neither do results. While a batch is trained, its
+checkpoints are in DIR/batches. A batch that was killed goes on from there with the runs that it had.
 
 Values at the start of each task are solved once for all runs of a study, and kept in the user's cache. A run needs the
-values of the optimal, the uniform and the worst policy only in start states; solving a large instance again for
+values of the optimal, the uniform and the worst policy only in start states. Solving a large instance again for
 each run would take longer than some training.
 """
 
@@ -32,7 +32,7 @@ def task_of_config(config: Mapping[str, Any]) -> "Task":
 
 
 def solve(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The values at the start of a task, as `TaskValues.to_dict` writes them; solved now unless they are stored."""
+    """The values at the start of a task, as `TaskValues.to_dict` writes them, solved now unless they are stored."""
     values = stored_values(config)
     if values is None:
         from pharos.training import TaskValues  # loads what an MDP needs
@@ -44,7 +44,7 @@ def solve(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def stored_values(config: Mapping[str, Any]) -> dict[str, Any] | None:
-    """The stored values for these rules; None if there are none, or if the file was changed."""
+    """The stored values for these rules. None if there are none, or if the file was changed."""
     stored = _cache().get(_dependencies(config))
     return None if stored is None else stored["values"]
 
@@ -85,7 +85,7 @@ def _dependencies(config: Mapping[str, Any]) -> dict[str, Any]:
 def train_batch(
     configs: Sequence[Mapping[str, Any]], folders: Sequence[Path], checkpoints: Path, *, device: str = "cpu"
 ) -> list[str | None]:
-    """Train runs in this process, with values that the study has solved already; raise the error of a single run."""
+    """Train runs in this process, with values that the study has solved already. Raise the error of a single run."""
     from pharos.training import FailedRun, PreparedRun, TaskCache, TaskValues, train_group
 
     def values(config: RunConfig) -> TaskValues | None:

@@ -12,7 +12,7 @@ from pharos.agents import agent_called, agent_source, hyperparameters
 from pharos.environments import Environment, as_tuples, class_source, import_class, make
 from pharos.errors import MissingExtra, ParameterError, UnknownName
 from pharos.observations import OwnObservation, names, own_observation, title
-from pharos.study.regression import MEASURES
+from pharos.study.regression import MODEL_MEASURES
 from pharos.system.sources import is_reference
 from pharos.system.storage import check_name
 from pharos.training import ENGINES, ChanceSetting, Horizon, RunConfig
@@ -46,7 +46,8 @@ class Run:
     Attributes:
         configuration: what determines its result.
         instance: name of the environment as the specification gives it, such as "frozen_lake/4x4".
-        engine: "batched" if it is trained together with others; a table, too, whose configuration does not say so.
+        engine: "batched" if it is trained together with others. A table is, too, though its configuration does not say
+            so.
         family: what it counts as when classes are compared: the class of its environment, unless the study says else.
         setting: name that distinguishes its cell from other blocks, if the study has one: "tuned".
         observation: the name of its observation in tables.
@@ -142,7 +143,7 @@ class _Part(BaseModel):
 
 
 class _Named(_Part):
-    """An entry with a name; a name of the user's own code is looked for in a folder."""
+    """An entry with a name. A name of the user's own code is looked for in a folder."""
 
     name: str
     _folder: Path | None = PrivateAttr(None)
@@ -167,13 +168,13 @@ class ObservationEntry(_Named):
 
     @cached_property
     def own(self) -> OwnObservation | None:
-        """The observation of the user's own of that name; None for one of pharos."""
+        """The user's own observation of that name, or None for one of pharos."""
         return own_observation(self.name, self._folder)
 
 
 class EnvironmentEntry(_Named):
-    """An environment: a name that `pharos.make` knows, and parameters; the class it counts as, if not its own; and what
-    is seen of it, if not what its block says."""
+    """An environment: a name that `pharos.make` knows, and parameters. Also the class it counts as, if not its own, and
+    what is seen of it, if not what its block says."""
 
     parameters: dict[str, Any] = {}
     family: str = Field("", pattern=NAME)
@@ -191,7 +192,7 @@ class EnvironmentEntry(_Named):
 
     @property
     def counts_as(self) -> str:
-        """Its family; for an imported MDP without one its label; "" if the class of the environment counts."""
+        """Its family. For an imported MDP without one, its label. Empty if the class of the environment counts."""
         return self.family or (self.label if self.is_imported else "")
 
     @cached_property
@@ -206,7 +207,7 @@ class Hardness(_Part):
     """Measures of hardness that are computed, their discount, and the seconds that each may take for one instance."""
 
     gamma: Gamma = 0.99
-    measures: list[str] = Field(default_factory=lambda: [name for name in MEASURES if name in registered_names()])
+    measures: list[str] = Field(default_factory=lambda: [name for name in MODEL_MEASURES if name in registered_names()])
     budget: Annotated[float, BeforeValidator(_number)] = Field(default=60.0, gt=0)
 
     @field_validator("measures")
@@ -224,7 +225,7 @@ class Hardness(_Part):
         The stationary effective horizon stands for the effective horizon if that is not taken.
         """
         stand_in = {"effective_horizon": "stationary_effective_horizon"}
-        names = [name if name in self.measures else stand_in.get(name) for name in MEASURES]
+        names = [name if name in self.measures else stand_in.get(name) for name in MODEL_MEASURES]
         return [name for name in names if name in self.measures] or list(self.measures)
 
 
@@ -303,7 +304,7 @@ class Specification(_Part):
         )
 
     def to_yaml(self, **changes: object) -> str:
-        """Text of a YAML file with these entries; `changes` replace some of them."""
+        """Text of a YAML file with these entries. `changes` replace some of them."""
         entries = self.model_dump(mode="json", exclude_unset=True)
         entries |= {name: value for name, value in changes.items() if name in entries}
         return yaml.safe_dump(entries, sort_keys=False, width=120)
@@ -381,7 +382,7 @@ def part_of(
     agents: Sequence[str] | None,
     observations: Sequence[str] | None,
 ) -> Iterator[Run]:
-    """Runs of some blocks, counted from 1, agents and observations; None: of all.
+    """Runs of some blocks, counted from 1, agents and observations. None: of all.
 
     Raises:
         ParameterError: one of these is not in the study.

@@ -36,11 +36,11 @@ def submit(
 
     Args:
         folder: of the results, on a disk that all machines share.
-        cluster: "slurm"; or "local": all jobs at once on this machine, to try it.
+        cluster: "slurm", or "local" for all jobs at once on this machine, to try it.
         parameters: of submitit's executor, such as {"timeout_min": 600, "slurm_partition": "cpu",
             "slurm_array_parallelism": 50}.
-        options: of `pharos.training.ExecutionOptions`, as for `run`, with one worker unless told otherwise; each job
-            has a shard of its own.
+        options: of `pharos.training.ExecutionOptions`, as for `run`, by default with one worker. Each job has a shard
+            of its own.
     Returns:
         submitit's jobs, one for each part in which runs are missing: `job.job_id`, `job.result()` waits. Their logs
         are in the folder `jobs`.
@@ -82,7 +82,7 @@ def _has_work(runs: Iterable[Run], directory: Path, retry_failed: bool) -> bool:
 
 
 def run_shard(folder: str, options: dict[str, Any]) -> dict[str, Any]:
-    """Execute a job's part of the study whose specification stands in the folder; the Status as a dictionary."""
+    """Execute a job's part of the study whose specification stands in the folder. Return the Status as a dictionary."""
     return run(specification(folder, trust=True), folder, **options).to_dict()
 
 
@@ -102,8 +102,8 @@ def run_on_ray(
     Args:
         batch_runner: of the runs that the study says are batched, as for `run`.
         folder: of the results, on a disk that all nodes share.
-        address: of the cluster; None for the one of this machine or RAY_ADDRESS, or else a new local one.
-        options: as for `run`; Ray decides how many runs are executed at once, and has no timeout.
+        address: of the cluster. Default: the cluster of this machine or of RAY_ADDRESS, or else a new local one.
+        options: as for `run`. Ray decides how many runs are executed at once, and has no timeout.
     Raises:
         MissingExtra: Ray is not installed.
     """
@@ -157,7 +157,7 @@ class RayTasks(Workers):
 
 
 def _attempt(*job: Any) -> list[Any]:
-    """Execute one run or a batch; return what `worker.main` sends, and its exit code."""
+    """Execute one run or a batch. Return what `worker.main` sends, and its exit code."""
     sent: list[Any] = []
     try:
         _worker.main(*(*job, sent.append))

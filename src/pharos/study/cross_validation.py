@@ -41,7 +41,7 @@ def calibration(y: np.ndarray, predicted: np.ndarray, classes: np.ndarray) -> tu
 
 
 def resampled_classes(count: int, resamples: int, seed: int) -> Counts:
-    """(R, C) counts of classes drawn anew, at least three different ones in each sample; none of fewer than four
+    """(R, C) counts of classes drawn anew, at least three different ones in each sample. None for fewer than four
     classes, which make but one such sample."""
     rng = np.random.default_rng(seed)
     drawn = rng.multinomial(count, np.full(count, 1 / count), resamples)
@@ -51,8 +51,8 @@ def resampled_classes(count: int, resamples: int, seed: int) -> Counts:
 def held_out(x: np.ndarray, y: np.ndarray, classes: np.ndarray, counts: Counts) -> tuple[np.ndarray, np.ndarray]:
     """((R,) R2, (R,) rho) of classes left out one by one, for samples of classes.
 
-    A class that counts twice is left out both times, so none is predicted from itself; its cells are ranked
-    twice. Rank correlations are of at most MOST_RANKED samples, the others are NaN.
+    A class that counts twice is left out both times, so none is predicted from itself. Its cells are ranked twice. Rank
+    correlations are of at most MOST_RANKED samples, the others are NaN.
     """
     means = np.stack([x[classes == each].mean(axis=0) for each in range(classes.max() + 1)]).mean(axis=0)
     spread = x.std(axis=0)
@@ -98,8 +98,8 @@ def permuted_classes(
 ) -> tuple[np.ndarray, np.ndarray]:
     """((1 + R,) R2, (1 + R,) rho) of left-out classes if each class has the predictors of another one.
 
-    First as it is, then for R permutations of classes. Only positions that all classes have are looked at; NaN if
-    there are fewer than three.
+    First as it is, then for R permutations of classes. Only positions that all classes have are looked at. NaN if there
+    are fewer than three.
 
     Args:
         positions: (N,) what a row is within its class, such as (its first instance, plain, vector). A row gets the
@@ -120,7 +120,7 @@ def permuted_classes(
 
 
 def _exchanged(x: np.ndarray, y: np.ndarray, orders: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """((R,) R2, (R,) rho) of left-out classes, x (C, K, P), y (C, K); class c has the x of class orders[r, c]."""
+    """((R,) R2, (R,) rho) of left-out classes, x (C, K, P), y (C, K). Class c has the x of class orders[r, c]."""
     design = np.concatenate([np.ones((*x.shape[:2], 1)), x], axis=2)
     products = np.einsum("ckp,ckq->cpq", design, design)[orders]
     targets = np.einsum("dkp,ck->dcp", design, y)[orders, np.arange(len(y))]
@@ -145,7 +145,7 @@ def ceiling(means: np.ndarray, noise: np.ndarray, classes: np.ndarray) -> float:
         1 - mean of noise / variance of the cells' means, classes weighing alike
 
     Args:
-        means, noise: (N,) of cells: the mean over seeds, and the variance over seeds / seeds; NaN of a single seed.
+        means, noise: (N,) of cells: the mean over seeds, and the variance over seeds / seeds. NaN for a single seed.
     Returns:
         NaN if no cell has two seeds.
     """

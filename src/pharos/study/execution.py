@@ -43,7 +43,7 @@ def train_run(config: Mapping[str, Any], folder: Path) -> None:
 
 
 def shard_of(runs: Sequence[Run], shard: str | tuple[int, int] | None) -> tuple[Run, ...]:
-    """The i-th of n parts of the runs, `i/n` with i from 1 to n; every n-th run, so that parts last about as long."""
+    """The i-th of n parts of the runs, `i/n` with i from 1 to n: every n-th run, so that parts last about as long."""
     if shard is None:
         return tuple(runs)
     try:
@@ -64,21 +64,21 @@ def run(
     runner: _worker.Runner = train_run,
     prepare: Callable[[Mapping[str, Any]], Any] | None = None,
     batch_runner: _worker.BatchRunner | None = None,
-    foretold: Callable[[Forecast], None] | None = None,
+    on_forecast: Callable[[Forecast], None] | None = None,
     **options: Any,
 ) -> Status:
     """Execute the runs of a study that are not over, on this machine.
 
     Args:
         source: YAML file, preset, mapping, Specification, or the folder of a study.
-        folder: of the results; None for that folder, or studies/NAME.
+        folder: of the results. Default: that folder, or studies/NAME.
         progress: called with a Status every now and then.
         runner: `runner(config, folder)`, a function of a module, which writes run.json and curve.csv.
-        prepare: called with one config of each instance, in a process of its own, before the runs; None: builds state
-            spaces for the usual runner, and does nothing for another.
-        batch_runner: `runner(configs, folders, folder for checkpoints)` of runs that the study says are batched; None:
-            the usual one for the usual runner, else each of them alone.
-        foretold: called before the first run with how many are to come, and how long they will take.
+        prepare: called with one config of each instance, in a process of its own, before the runs. By default it builds
+            state spaces for the usual runner, and does nothing for another.
+        batch_runner: `runner(configs, folders, folder for checkpoints)` of runs that the study says are batched.
+            Default: the usual one for the usual runner, else each of them alone.
+        on_forecast: called before the first run with how many are to come, and how long they will take.
         options: of `pharos.training.ExecutionOptions`: shard, retry_failed, resume, timeout, workers, device, block,
             agent, observation.
     Returns:
@@ -86,17 +86,18 @@ def run(
     Raises:
         ParameterError: the specification or an option is wrong, the folder holds another study, or torch has no such
             device here.
-        AllRunsFailed: every run has failed; its `outcome` is the Status.
+        AllRunsFailed: every run has failed. Its `outcome` is the Status.
     """
+    on_forecast = options.pop("foretold", on_forecast)  # its name before
     execution = StudyExecution(*opened(source, folder), ExecutionOptions(**options), runner, batch_runner, progress)
     missing = execution.missing
     if missing and runner is train_run:
-        refuse_missing(execution.options.device)
-    if foretold is not None and missing:
-        foretold(execution.forecast())
+        check_device_in_process(execution.options.device)
+    if on_forecast is not None and missing:
+        on_forecast(execution.forecast())
     if prepare is None and runner is train_run:
         prepare = prepare_instance
-    if prepare is not None:  # a failure there is left to the runs to tell
+    if prepare is not None:  # the runs report a failure there
         prepare_instances(prepare, missing, execution.report)
     end = execution.run()
     if end.failed and end.failed == end.total:
@@ -105,7 +106,7 @@ def run(
 
 
 class StudyExecution(Execution[Run]):
-    """Execution of the runs of a study that are not over; arguments as for `run`.
+    """Execution of the runs of a study that are not over. Arguments are the same as for `run`.
 
     Args:
         pool: None: processes of this machine.
@@ -163,7 +164,7 @@ class StudyExecution(Execution[Run]):
         return Forecast(len(self.missing), steps, int(self.num_workers), self._remaining())
 
     def run(self) -> Status:
-        """Execute the missing runs; return the Status at the end."""
+        """Execute the missing runs, and return the Status at the end."""
         try:
             self.execute()
         except BaseException:
@@ -192,7 +193,7 @@ class StudyExecution(Execution[Run]):
         self.halve(key, [run for run in self.running[key][0] if run.id in ids], reason)
 
     def look(self) -> None:
-        """Count the runs that other runners have finished, by one listing of the folder; and report."""
+        """Count the runs that other runners have finished, by one listing of the folder, and report."""
         if time.monotonic() - self.last_listing >= OTHERS_SECONDS:
             self.last_listing = time.monotonic()
             with contextlib.suppress(OSError):
@@ -214,7 +215,7 @@ class StudyExecution(Execution[Run]):
         self.record_result(run, False)
 
     def record_result(self, run: Run, again: bool = False) -> bool:
-        """Read and count the result of a run that is over; False if it has to be executed, a damaged one again."""
+        """Read and count the result of a run that is over. False if it has to be executed, a damaged one again."""
         try:
             record = _worker.run_record(self.folder / "runs" / run.id)
         except FileFormatError as error:
@@ -248,7 +249,7 @@ class StudyExecution(Execution[Run]):
         return seconds / self.num_workers
 
     def report(self, preparing: str = "", *, final: bool = False) -> Status:
-        """The Status now, which `progress` is called with; every STATUS_SECONDS it is written into the folder."""
+        """The Status now, which `progress` is called with. Every STATUS_SECONDS it is written into the folder."""
         now = Status(
             name=self.study.name,
             folder=str(self.folder),
@@ -297,7 +298,7 @@ def prepare_instance(config: Mapping[str, Any]) -> None:
 def prepare_instances(
     prepare: Callable[[Mapping[str, Any]], Any], runs: Iterable[Run], progress: Callable[[str], Any]
 ) -> None:
-    """Call `prepare` with one config of each instance of the runs, and `progress` with a text; failures are ignored.
+    """Call `prepare` with one config of each instance of the runs, and `progress` with a text. Failures are ignored.
 
     A separate process prepares them one after the other. If it dies, another goes on with the next.
     """
@@ -320,7 +321,7 @@ def prepare_instances(
                     todo.popleft()
 
 
-def refuse_missing(device: str) -> None:
+def check_device_in_process(device: str) -> None:
     """Raise ParameterError for a device that torch does not have here, before each run fails for it.
 
     A process of its own asks torch: it would keep some of a GPU's memory.
@@ -347,7 +348,7 @@ def _ask_for_device(device: str, send: Callable[[ParameterError], None]) -> None
 def _prepare_all(
     prepare: Callable[[Mapping[str, Any]], Any], configs: Iterable[Mapping[str, Any]], send: Callable[[str], None]
 ) -> None:
-    """Prepare instances one after the other; send "" after each, and the reason if one waits."""
+    """Prepare instances one after the other. Send "" after each, and the reason if one waits."""
     for config in configs:
         with contextlib.suppress(Exception):  # the runs of this instance will fail with the same error, and say so
             unless_locked(prepare, config, send)
@@ -357,7 +358,7 @@ def _prepare_all(
 def unless_locked(
     prepare: Callable[[Mapping[str, Any]], Any], config: Mapping[str, Any], on_wait: Callable[[str], None]
 ) -> None:
-    """Prepare an instance; if another process is building it, wait for that one."""
+    """Prepare an instance. If another process is building it, wait for that one."""
     while True:
         try:
             prepare(config)

@@ -51,8 +51,8 @@ class Line:
 
     Attributes:
         label: in words, `DQN, image`.
-        color, dash: `#0072B2`; as matplotlib writes it, such as `--`.
-        x: (T,) if it is known; mean, lower, upper: (T,) the line and the ends of its interval.
+        color: such as `#0072B2`. dash: as matplotlib writes it, such as `--`.
+        x: (T,) if it is known. mean, lower, upper: (T,) the line and the ends of its interval.
         runs: name of each run -> (T,) its values.
     """
 
@@ -79,7 +79,7 @@ class Curves:
     """A figure of panels that share their axes' meaning.
 
     Attributes:
-        share: values are shares in [0, 1], over scores; else they are over steps, and start at 0.
+        share: values are shares in [0, 1], over scores. Otherwise they are over steps, and start at 0.
         draws_runs: whether the printed figure has a thin line for each run.
     """
 
@@ -90,7 +90,7 @@ class Curves:
     draws_runs: bool = False
 
     def to_json(self) -> str:
-        """The curves as the page draws them: numbers of DIGITS digits; runs if there are at most MOST_RUNS."""
+        """The curves as the page draws them: numbers of DIGITS digits, and runs if there are at most MOST_RUNS."""
         panels = []
         for panel in self.panels:
             num_runs = sum(len(line.runs) for line in panel.lines)
@@ -108,7 +108,7 @@ def _numbers(line: Line, runs: bool) -> dict[str, Any]:
 
 
 def _short(values: np.ndarray) -> list[float | int | None]:
-    """The values with DIGITS significant digits, whole ones as integers; null for what is not finite."""
+    """The values with DIGITS significant digits, whole ones as integers. null stands for what is not finite."""
     texts = [f"{value:.{CURVE_DIGITS}g}" if np.isfinite(value) else "null" for value in np.asarray(values, np.float64)]
     return [None if text == "null" else int(float(text)) if float(text).is_integer() else float(text) for text in texts]
 
@@ -200,7 +200,7 @@ OTHER_IMAGE = "complex_image"
 
 
 def lines(curves: Curves) -> "Figure | None":
-    """A panel for each group, with a line and its interval for each agent and observation; None without panels."""
+    """A panel for each group, with a line and its interval for each agent and observation. None without panels."""
     if not curves.panels:
         return None
     figure, axes = panels(len(curves.panels), 3.3, 2.7)
@@ -270,7 +270,7 @@ def agents_against_each_other(cells: "pd.DataFrame", value: str, agents: tuple[s
 def _against(
     cells: "pd.DataFrame", column: str, value: str, both: tuple[str, str], words: Sequence[str]
 ) -> "Figure | None":
-    """The value with one entry of `column` against the value with another; None if no cell has both."""
+    """The value with one entry of `column` against the value with another. None if no cell has both."""
     index = [name for name in CELL if name != column]
     wide = cells.pivot_table(index=index, columns=column, values=value)
     if not {*both} <= {*wide.columns} or not len(wide := wide[list(both)].dropna().reset_index()):
@@ -291,7 +291,7 @@ def _against(
 
 
 def fitted_against_actual(fits: Sequence[Fit], regret: str) -> "Figure":
-    """A panel for each fit: what the model gives against what was measured; a perfect model is the dotted diagonal."""
+    """A panel for each fit: what the model gives against what was measured. A perfect model is the dotted diagonal."""
     figure, axes = panels(len(fits), 3.1, 3.0)
     for axis, fit in zip(axes, fits, strict=False):
         names = list(dict.fromkeys(fit.classes)) or [""]
@@ -316,7 +316,7 @@ def fitted_against_actual(fits: Sequence[Fit], regret: str) -> "Figure":
 def all_figures(
     curves: Mapping[str, Curves], cells: "pd.DataFrame", models: Sequence[Models], agents: Sequence[str]
 ) -> dict[str, Callable[[], "Figure | None"]]:
-    """Functions that draw the figures, by name; fits are drawn for the first agent."""
+    """Functions that draw the figures, by name. Fits are drawn for the first agent."""
     figures: dict[str, Callable[[], Figure | None]] = {name: partial(lines, each) for name, each in curves.items()}
     for agent, image in pairs_of(cells, agents):
         figures[representations_figure(agent, image)] = partial(representations, cells, agent=agent, image=image)

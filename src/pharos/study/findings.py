@@ -36,10 +36,10 @@ Effect = tuple[float, float, float]  # with the ends of its 95 % interval
 def findings(cells: "pd.DataFrame", models: Models, *, resamples: int = 1000) -> "pd.DataFrame":
     """Return the findings of the paper's sections 4.1 to 4.3 and appendix C beside what the data say.
 
-    A task is an instance under one kind of chance; every test counts it once, whatever the number of its observations.
+    A task is an instance under one kind of chance. Every test counts it once, whatever the number of its observations.
 
     - Which observation costs DQN more regret, for each class: the normalised regret of both on the same tasks,
-      Wilcoxon's signed-rank test, two-sided; likewise, whether a table or DQN with vectors has more regret. The effect
+      Wilcoxon's signed-rank test, two-sided. Likewise, whether a table or DQN with vectors has more regret. The effect
       is the difference by Hodges and Lehmann, image less vector and table less DQN, with the interval of the test.
     - One linear model of all explains next to nothing: the F test of class and measures on the means of the tasks over
       observations. If it is significant, the verdict adds "mostly by class" if class and representation alone
@@ -59,8 +59,8 @@ def findings(cells: "pd.DataFrame", models: Models, *, resamples: int = 1000) ->
         interval, p-value (NaN if an interval decides), the power, and the verdict: "agrees" or "disagrees" if
         the test is significant at 0.05, "undecided" if it is not, "no data".
         The power is the probability that these tasks find the effect, at 0.05, if it is as large as the paper
-        prints: its R2 for the F tests, its r, its difference of R2; of observations, whose sizes it does not print, a
-        difference of SMALLEST_DIFFERENCE. "undecided" with little power says nothing against the paper.
+        prints: its R2 for the F tests, its r, its difference of R2. For observations, whose sizes it does not print, a
+            difference of SMALLEST_DIFFERENCE. "undecided" with little power says nothing against the paper.
     Cost: `resamples` small regressions.
     """
     import pandas as pd
@@ -92,7 +92,7 @@ def _row(
 
 
 def _power_of_mean(effect: float, deviation: float, number: int) -> float:
-    """Probability that a two-sided test at LEVEL finds a mean difference; ranks need pi / 3 as many normal values."""
+    """Probability that a two-sided test at LEVEL finds a mean difference. Ranks need pi / 3 as many normal values."""
     from scipy import stats
 
     if number < 2:
@@ -172,7 +172,7 @@ class _Tasks:
     Attributes:
         names: of the tasks.
         regrets: (T, R).
-        design: (T, P) predictors that belong to a task, the intercept first; predictors of observations are left out.
+        design: (T, P) predictors that belong to a task, the intercept first. Predictors of observations are left out.
         class_design: the first columns of that, without the measures of hardness.
     """
 
@@ -223,8 +223,8 @@ def _f_test(small: float, large: float, added: int, free: int) -> tuple[float, f
 
 
 def _share(statistic: float, added: int, free: int) -> Effect:
-    """Effect of an F test: the share of the smaller model's residual squares that the larger one explains; its
-    interval follows from the interval of the noncentrality.
+    """Effect of an F test: the share of the smaller model's residual squares that the larger one explains. Its interval
+    follows from the interval of the noncentrality.
 
     Source: Steiger (2004), Beyond the F test, with f2 (u + v + 1) as the noncentrality.
     """
@@ -358,7 +358,7 @@ def _power_of_error(effect: float, error: float) -> float:
 
 
 def _r_squared(fit: Fit, rows: np.ndarray) -> float:
-    """R2 of the same model fitted to some of the rows; NaN if they are all alike."""
+    """R2 of the same model fitted to some of the rows, or NaN if they are all alike."""
     design, actual = fit.design[rows], fit.actual[rows]
     coefficients, *_ = np.linalg.lstsq(design, actual, rcond=None)
     return r_squared(actual, actual - design @ coefficients)

@@ -54,8 +54,8 @@ def outcomes(runs: "pd.DataFrame", points: "pd.DataFrame") -> "pd.DataFrame":
     Args:
         runs, points: of `table` and `curves`.
     Returns:
-        CELL; OUTCOMES, `cumulative` before its logarithm; for each the column NAME_noise, its variance over the seeds
-        that have it, divided by their number (NaN of one seed); `random_scale`, what random play would lose in as many
+        CELL. OUTCOMES, `cumulative` before its logarithm. For each the column NAME_noise, its variance over the seeds
+        that have it, divided by their number (NaN for one seed). `random_scale`, what random play would lose in as many
         episodes.
     """
     regret = points["normalized_regret"]
@@ -82,7 +82,7 @@ class Model:
 
     Attributes:
         name: of the predictor, or of several together.
-        columns: of the table; none for the mean alone.
+        columns: of the table. None for the mean alone.
         is_baseline: whether others are to beat it.
     """
 
@@ -95,7 +95,7 @@ def models_of(frame: "pd.DataFrame", predictors: Sequence[str], measures: Sequen
     """Models of the predictors, and of the baselines that the table has columns for.
 
     Args:
-        measures: tabular ones; each alone too, if there are no predictions.
+        measures: tabular ones. Each is judged alone too, if there are no predictions.
     """
     models = [
         Model(name, (name,), name in BASELINE_MODELS)
@@ -121,31 +121,43 @@ def unseen_classes(
     permutations: int = PERMUTATIONS,
     seed: int = 0,
 ) -> "pd.DataFrame":
-    """Return how well each predictor orders and predicts each outcome of each agent; a row each, baselines included.
+    """Return how well each predictor orders and predicts each outcome of each agent: a row each, baselines included.
 
     Args:
-        predictions: of `predict`; None: the measures alone are judged.
+        predictions: of `predict`. None: the measures alone are judged.
         cells: of `outcomes`.
-        predictors: columns of the predictions; None: all of ours, and the numbers that a user's measures added.
-        measures: of `hardness_table`; their logarithms together are a baseline.
+        predictors: columns of the predictions. Default: all of ours, and the numbers that a user's measures added.
+        measures: of `hardness_table`. Their logarithms together are a baseline.
         least_classes: with fewer there is an error.
-        permutations: of classes, and of observations within them; 0: no floors and no p-values of these.
+        permutations: of classes, and of observations within them. 0: no floors and no p-values of these.
     Returns:
-        Columns `agent`, `outcome`, `predictor`, `baseline`, `cells`, `classes`, then
-        left out: `r_squared` and `rho` (Spearman's) of classes left out one by one, with the ends of their 95 %
-            intervals over classes drawn anew (NaN of fewer than four); `floor_r_squared` and `floor_rho`, what 95 % of
-            permutations of classes stay below; `p_rho`; `r_squared_mdp`, each instance left out with all its kinds of
-            chance; `calibration` and `calibration_offset`, slope and intercept of the outcome on what was predicted;
-            `ceiling`, the largest R2 that noise over seeds leaves;
-        within: `rho_within`, the mean over classes of the rank correlation within; `pairs`, of observations of one MDP
-            whose outcomes differ by more than 0.05; `agreement`, the share of them that is ordered rightly, with
-            interval, `p_agreement` and `agreement_ceiling`, what noise over seeds leaves; `image_pairs`,
-            `image_agreement`, of image against vector alone;
-        mixed: `slope` of the standardised predictor in a mixed model with random classes and MDPs, `slope_error`,
-            `p_slope`, and the shares of the variance that it leaves to `class_share`, `mdp_share`; `given_tabular`,
-            `given_tabular_regret`, partial rank correlations given the tabular measures, and given the regret of the
-            tabular learner, with intervals;
-        `tests`, how many p-values the table has, and each of them corrected for that number (Holm) as NAME_holm.
+        Columns `agent`, `outcome`, `predictor`, `baseline`, `cells`, `classes`, and these.
+
+        Of classes left out one by one:
+
+        - `r_squared` and `rho` (Spearman's), with the ends of their 95 % intervals over classes drawn anew (NaN for
+          fewer than four)
+        - `floor_r_squared` and `floor_rho`: what 95 % of permutations of classes stay below, and `p_rho`
+        - `r_squared_mdp`: each instance left out with all its kinds of chance
+        - `calibration` and `calibration_offset`: slope and intercept of the outcome on what was predicted
+        - `ceiling`: the largest R2 that noise over seeds leaves
+
+        Within classes:
+
+        - `rho_within`: the mean over classes of the rank correlation within
+        - `pairs`: of observations of one MDP whose outcomes differ by more than 0.05
+        - `agreement`: the share of pairs that is ordered rightly, with interval, `p_agreement` and
+          `agreement_ceiling`, what noise over seeds leaves
+        - `image_pairs`, `image_agreement`: of image against vector alone
+
+        By a mixed model and partial correlations:
+
+        - `slope` of the standardised predictor in a model with random classes and MDPs, `slope_error`,
+          `p_slope`, and the shares of the variance that it leaves to `class_share`, `mdp_share`
+        - `given_tabular`, `given_tabular_regret`: partial rank correlations given the tabular measures, and given the
+          regret of the tabular learner, with intervals
+
+        And `tests`, how many p-values the table has, and each of them corrected for that number (Holm) as NAME_holm.
     Raises:
         ParameterError: there are no cells that both have, or too few classes.
     """
@@ -252,7 +264,7 @@ def _numbers(frame: "pd.DataFrame", columns: Sequence[str]) -> np.ndarray:
 def _line(
     part: "pd.DataFrame", model: Model, outcome: str, tabular: Sequence[str], permutations: int, seed: int
 ) -> dict[str, float] | None:
-    """Statistics of a model of an outcome, by column; None with fewer than two classes, or if nothing varies."""
+    """Statistics of a model of an outcome, by column. None with fewer than two classes, or if nothing varies."""
     cells = Cells.of(part, model.columns, outcome)
     count = len(np.unique(cells.classes))
     if count < 2 or np.ptp(cells.y) == 0 or (model.columns and (np.ptp(cells.x, axis=0) == 0).all()):
@@ -264,7 +276,7 @@ def _line(
 
 
 def _left_out(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[str, float]:
-    """Statistics of classes and MDPs left out; rank correlations are NaN if there is no predictor."""
+    """Statistics of classes and MDPs left out. Rank correlations are NaN if there is no predictor."""
     x, y, classes = cells.x, cells.y, cells.classes
     count = classes.max() + 1
     scores, rho = cross_validation.held_out(x, y, classes, np.ones((1, count), int))
@@ -298,14 +310,14 @@ def _left_out(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[
 
 
 def _noise(cells: Cells, outcome: str) -> np.ndarray | None:
-    """(N,) the variance of the mean over seeds; None if it is not known, or does not hold for the logarithm."""
+    """(N,) the variance of the mean over seeds. None if it is not known, or does not hold for the logarithm."""
     if outcome == ABSOLUTE or f"{outcome}_noise" not in cells.frame:
         return None
     return cells.frame[f"{outcome}_noise"].to_numpy(float)
 
 
 def _within(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[str, float]:
-    """Statistics within classes and MDPs; NaN of several predictors together, and of none."""
+    """Statistics within classes and MDPs. NaN for several predictors together, and for none."""
     row = {"rho_within": np.nan, "pairs": 0, "agreement": np.nan}
     row |= dict.fromkeys(("agreement_lower", "agreement_upper", "p_agreement", "agreement_ceiling"), np.nan)
     row |= {"image_pairs": 0, "image_agreement": np.nan}
@@ -340,7 +352,7 @@ def _within(cells: Cells, outcome: str, permutations: int, seed: int) -> dict[st
 
 
 def _mixed(cells: Cells, model: Model, tabular: Sequence[str], seed: int) -> dict[str, float]:
-    """The mixed model and partial correlations; NaN of several predictors together, and of none."""
+    """The mixed model and partial correlations. NaN for several predictors together, and for none."""
     names = ("slope", "slope_error", "p_slope", "class_share", "mdp_share")
     row: dict[str, float] = dict.fromkeys(names, np.nan)
     for name in ("given_tabular", "given_tabular_regret"):
@@ -378,7 +390,7 @@ class MixedFit:
     """Fit of y = intercept + slope z + class + MDP + residual, by restricted maximum likelihood.
 
     Attributes:
-        slope: of the standardised predictor z, in units of the outcome; error: its standard error.
+        slope: of the standardised predictor z, in units of the outcome. error: its standard error.
         p_value: two-sided, of slope / error under Student's t with two degrees of freedom fewer than classes: a
             predictor can differ between classes alone, and the normal distribution would trust few classes too much.
         class_variance, mdp_variance, residual_variance: of the random parts and of what is left.
@@ -393,7 +405,7 @@ class MixedFit:
 
 
 def mixed_fit(x: np.ndarray, y: np.ndarray, classes: np.ndarray, mdps: np.ndarray) -> MixedFit | None:
-    """Fit the model to cells: x, y (N,), classes and mdps (N,) integers; MDPs of different classes are different.
+    """Fit the model to cells: x, y (N,), classes and mdps (N,) integers. MDPs of different classes are different.
 
     Returns:
         None if there are fewer than three classes, x is constant, or no maximum of the likelihood is found.

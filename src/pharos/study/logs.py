@@ -34,15 +34,15 @@ def log(
     progress: Callable[[str], None] | None = None,
     trust: bool | None = None,
 ) -> int:
-    """Write the curves of the finished runs that were not written yet; return how many.
+    """Write the curves of the finished runs that were not written yet, and return how many.
 
     Nothing is trained, and nothing of the results changes. A run keeps its name and identity, and may be written again.
 
     Args:
         source: YAML file, preset, mapping, Specification, the folder of a study, or the name of one in `studies`.
-        folder: of the results; None for that folder, or studies/NAME.
-        to: "tensorboard", for event files in the folder `tensorboard` of the study; or "wandb".
-        project: of Weights & Biases; None for the name of the study.
+        folder: of the results. Default: that folder, or studies/NAME.
+        to: "tensorboard", for event files in the folder `tensorboard` of the study, or "wandb".
+        project: of Weights & Biases. Default: the name of the study.
         offline: Weights & Biases keeps its files in the folder `wandb` of the study, for `wandb sync` to send.
         progress: called with what is being written.
     Raises:
@@ -72,7 +72,7 @@ class RunLog:
         self.write = self._tensorboard() if self.to == "tensorboard" else self._wandb()
 
     def update(self, progress: Callable[[str], None] = lambda _: None) -> int:
-        """Write the runs that are finished and not written yet; return how many."""
+        """Write the runs that are finished and not written yet, and return how many."""
         written = self.directory / self.to / "written"
         number = 0
         for run, name in named_runs(self.study):

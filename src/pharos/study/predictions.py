@@ -36,14 +36,14 @@ class NamedStudy(Protocol):
 
 
 def write_predictions(study: "NamedStudy", predictions: "pd.DataFrame", file: str | os.PathLike) -> dict[str, str]:
-    """Write predictions into a Parquet file with their SHA-256, the date and the version; return these.
+    """Write predictions into a Parquet file with their SHA-256, the date and the version, and return these.
 
     The hash is of the rows alone: the same predictions have the same hash on any day. No prediction is lost.
     If the file holds the same ones, it stays, and its date is returned. If it holds others, it is kept beside, with its
     date in its name.
 
     Raises:
-        OSError: the file cannot be written; an older one then stays as it was.
+        OSError: the file cannot be written. An older one then stays as it was.
     """
     import pyarrow as pa
 
@@ -75,7 +75,7 @@ def write_predictions(study: "NamedStudy", predictions: "pd.DataFrame", file: st
 
 
 def _description(file: Path) -> dict[str, str] | None:
-    """Study, hash, date and version of a file of predictions; None if there is no such file."""
+    """Study, hash, date and version of a file of predictions, or None if there is no such file."""
     try:
         return read_predictions(file)[1]
     except PharosError:
@@ -90,7 +90,7 @@ def _place_beside(file: Path, date: str) -> Path:
 
 
 def read_predictions(file: str | os.PathLike) -> "tuple[pd.DataFrame, dict[str, str]]":
-    """Read a file of `write_predictions`: the rows; study, hash, date and version.
+    """Read a file of `write_predictions`: the rows, and study, hash, date and version.
 
     Raises:
         FileFormatError: it is no file of predictions. ResultCorrupted: it was changed after it was written.
@@ -148,7 +148,7 @@ class PredictedCells:
 
     @staticmethod
     def of(predictions: "Predictions | Sequence[Predictions] | None") -> "PredictedCells | None":
-        """Predictions of one file or of several; None if there are none."""
+        """Predictions of one file or of several, or None if there are none."""
         parts = [predictions] if isinstance(predictions, tuple) else list(predictions or ())
         return PredictedCells(parts) if parts else None
 

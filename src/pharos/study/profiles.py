@@ -1,7 +1,7 @@
 """Performance profiles of agents and observations in a study, differences, and how probable one improves on another.
 
 The score of a run is 1 minus its normalised regret: 1 is optimal from the first episode on, 0 as bad as acting at
-random. A task is an instance under one kind of chance; runs are resampled within each task.
+random. A task is an instance under one kind of chance. Runs are resampled within each task.
 
 Source: Agarwal et al. (2021), Deep reinforcement learning at the edge of the statistical precipice, section 4 (the
 authors' library does not import beside pandas 3).
@@ -76,8 +76,8 @@ def improvements(runs: "pd.DataFrame", *, resamples: int = 500) -> "pd.DataFrame
     Args:
         runs: as from `table`.
     Returns:
-        Columns IMPROVEMENT_COLUMNS; `ours` and `theirs` are pairs "agent, observation" that have runs on the same
-        tasks; the interval is the 95 % stratified bootstrap's, NaN if a task has one run.
+        Columns IMPROVEMENT_COLUMNS. `ours` and `theirs` are pairs "agent, observation" that have runs on the same
+        tasks. The interval is the 95 % stratified bootstrap's, NaN if a task has one run.
     """
     import pandas as pd
 
@@ -105,8 +105,8 @@ def regret_differences(runs: "pd.DataFrame") -> "pd.DataFrame":
     Args:
         runs: as from `table`.
     Returns:
-        Columns DIFFERENCE_COLUMNS; `ours` and `theirs` are pairs (agent, observation), `difference` is the regret of
-        the first less the regret of the second, with Student's 95 % interval over runs within tasks; `p_value` belongs
+        Columns DIFFERENCE_COLUMNS. `ours` and `theirs` are pairs (agent, observation), `difference` is the regret of
+        the first less the regret of the second, with Student's 95 % interval over runs within tasks. `p_value` belongs
         to Welch's t, and `adjusted` is the same after Holm's correction for the number of rows. NaN if a task has one
         run.
     """
@@ -133,7 +133,7 @@ def other_winners(runs: "pd.DataFrame") -> "pd.DataFrame":
     Args:
         runs: as from `table`.
     Returns:
-        Columns `instance`, `chance`; `most` and `least`, the pairs (agent, observation) with the highest return and
+        Columns `instance` and `chance`, `most` and `least`, the pairs (agent, observation) with the highest return and
         with the least regret, and of both the means `most_return`, `most_regret`, `least_return`, `least_regret`. The
         attribute `attrs["tasks"]` counts the tasks that several of them have.
     """

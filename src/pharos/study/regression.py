@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from statsmodels.regression.linear_model import RegressionResultsWrapper
 
-MEASURES = ("effective_horizon", "sum_of_reciprocal_gaps", "diameter")
+MODEL_MEASURES = ("effective_horizon", "sum_of_reciprocal_gaps", "diameter")
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class Fit:
         coefficients: one row a predictor: estimate, standard error, p-value, lower and upper end of its 95 % interval.
         dropped: predictors left out because they are constant or a linear combination of the others.
         condition_number: of the standardised predictors.
-        fitted, actual: one entry a row; influence: Cook's distances, NaN if a row alone determines a coefficient;
-            classes: of environments; tasks: instance and chance; observations: what the agent saw.
+        fitted, actual: one entry a row. influence: Cook's distances, NaN if a row alone determines a coefficient,
+            classes: of environments. tasks: instance and chance. observations: what the agent saw.
         design: (rows, predictors), as they entered, in the order of `coefficients`.
     """
 
@@ -66,7 +66,7 @@ class Fit:
     design: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
 
 
-def fit_models(rows: "pd.DataFrame", measures: Sequence[str] = MEASURES) -> tuple[list[Fit], list[str]]:
+def fit_models(rows: "pd.DataFrame", measures: Sequence[str] = MODEL_MEASURES) -> tuple[list[Fit], list[str]]:
     """The single model (equation 7), one model a representation (8), one model a class (9).
 
     Returns:
@@ -99,7 +99,7 @@ def fit_models(rows: "pd.DataFrame", measures: Sequence[str] = MEASURES) -> tupl
 
 
 def fit(rows: "pd.DataFrame", model: str, subset: str, predictors: Sequence[str]) -> Fit:
-    """One fit; predictors that are constant or collinear in these rows are dropped and named.
+    """One fit. Predictors that are constant or collinear in these rows are dropped and named.
 
     Raises:
         ParameterError: there are too few rows for the coefficients, or all regrets are the same.
@@ -149,7 +149,7 @@ def fit(rows: "pd.DataFrame", model: str, subset: str, predictors: Sequence[str]
 
 
 def _tasks(rows: "pd.DataFrame") -> tuple[str, ...]:
-    """The task of each row; empty if the rows have no instance and chance."""
+    """The task of each row, empty if the rows have no instance and chance."""
     if not {"instance", "chance"} <= {*rows}:
         return ()
     return tuple(map(" ".join, zip(rows["instance"], rows["chance"], strict=True)))
@@ -157,7 +157,7 @@ def _tasks(rows: "pd.DataFrame") -> tuple[str, ...]:
 
 def _errors_without_the_task(design: np.ndarray, residuals: np.ndarray, tasks: Sequence[str]) -> np.ndarray:
     """(N,) the error of each row under the model fitted without its task: (I - H)^-1 residuals, H the task's block of
-    the hat matrix; the shortest such vector if the task alone determines a coefficient.
+    the hat matrix. The shortest such vector if the task alone determines a coefficient.
     """
     basis, _ = np.linalg.qr(design)
     errors = np.empty(len(residuals))
@@ -178,7 +178,7 @@ def aggregate_r_squared(fits: Sequence[Fit]) -> float:
     return r_squared(actual, actual - np.concatenate([fit.fitted for fit in fits]))
 
 
-def leave_one_class_out_r_squared(rows: "pd.DataFrame", measures: Sequence[str] = MEASURES) -> float:
+def leave_one_class_out_r_squared(rows: "pd.DataFrame", measures: Sequence[str] = MODEL_MEASURES) -> float:
     """R2 of predictions for each class by a model fitted on the others (representation and measures only).
 
     Returns:
@@ -245,7 +245,7 @@ def _independent(rows: "pd.DataFrame", predictors: Sequence[str]) -> tuple[list[
 
 
 def _coefficients(result: "RegressionResultsWrapper", rows: "pd.DataFrame", tasks: Sequence[str]) -> "pd.DataFrame":
-    """Estimates of least squares with standard errors that count a task once; see the head of this file."""
+    """Estimates of least squares with standard errors that count a task once, see the head of this file."""
     import pandas as pd
     from scipy import stats
 

@@ -49,7 +49,7 @@ Loc = tuple[int | str, ...]
 
 
 def where(name: str, root: "yaml.Node | None", loc: Loc) -> str:
-    """`file:line`, the line of the innermost node on the path that exists; the path itself if there is no file."""
+    """`file:line`, the line of the innermost node on the path that exists, or the path itself if there is no file."""
     if root is None:
         return ".".join(map(str, (name, *loc)))
     node, line = root, root.start_mark.line
@@ -98,13 +98,13 @@ def specification(
     mapping.
 
     Args:
-        environments: a YAML file with a list of environments, for blocks that say `environments: given`; see
+        environments: a YAML file with a list of environments, for blocks that say `environments: given`, see
             `given_environments`.
-        trust: whether code that it names may be imported; None: if `source` is a YAML file, but for the study.yaml
+        trust: whether code that it names may be imported. Default: if `source` is a YAML file, but for the study.yaml
             beside results.
     Raises:
-        UnknownName: no such file or preset. ParameterError: something in it is wrong; the message names file, line and
-            key.
+        UnknownName: no such file or preset. ParameterError: something in it is wrong. The message names file, line and
+        key.
         UntrustedCode: it names code, and is not trusted.
     """
     if isinstance(source, Specification):
@@ -129,7 +129,7 @@ def specification(
 
 
 def given_environments(file: str | os.PathLike, *, trust: bool = False) -> list[Any]:
-    """The list in a YAML file: entries as under `environments:` of a block; folders are looked for beside the file.
+    """The list in a YAML file: entries as under `environments:` of a block. Folders are looked for beside the file.
 
         - taxi/5x5
         - {name: taxi, parameters: {size: 7}}
@@ -137,7 +137,7 @@ def given_environments(file: str | os.PathLike, *, trust: bool = False) -> list[
         - {name: "games.py:Snake", parameters: {rows: 2}}                           # a class of one's own
 
     Args:
-        trust: whether classes of one's own may be imported; a preset looks for their files beside the list, a study's
+        trust: whether your own classes may be imported. A preset looks for their files beside the list, a study's
             own YAML file beside itself.
     Raises:
         ParameterError: it is no such list. UntrustedCode: it names code, and is not trusted.
@@ -181,7 +181,7 @@ def _studies_here() -> list[str]:
 
 
 def study_name(file: Path) -> str | None:
-    """The name in a YAML file of a study, which is not looked at otherwise; None if there is none."""
+    """The name in a YAML file of a study, which is not looked at otherwise. None if there is none."""
     try:
         _, data = nodes_and_data(read_text(file), str(file))
     except ParameterError:
@@ -207,7 +207,7 @@ def parse(
 
     Args:
         name: stands before the line number in messages.
-        folder: of the modules and files that it names; None: the current directory.
+        folder: of the modules and files that it names. Default: the current directory.
         trust: whether they may be imported.
         entries: the environments of blocks that say `environments: given`.
     """

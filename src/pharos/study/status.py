@@ -36,12 +36,12 @@ class Status:
 
     Attributes:
         name, folder: of the study.
-        total, finished, failed, running: numbers of runs; those in `running` are started and not over.
+        total, finished, failed, running: numbers of runs. Runs in `running` are started and not over.
         errors: of the failed runs, by id.
-        damaged: what is wrong with results that cannot be read, by id; such runs count as missing, and are executed
+        damaged: what is wrong with results that cannot be read, by id. Such runs count as missing, and are executed
             again.
         elapsed, remaining: seconds since this runner began, and until the end as far as one can tell (None: not yet).
-        preparing: what is built or solved before the runs; empty otherwise.
+        preparing: what is built or solved before the runs, empty otherwise.
     """
 
     name: str
@@ -87,7 +87,7 @@ class Forecast:
     Attributes:
         runs, steps: how many are missing.
         workers: processes.
-        seconds: until the last is finished, at the pace of finished runs; None: no run is finished.
+        seconds: until the last is finished, at the pace of finished runs. None: no run is finished.
     """
 
     runs: int
@@ -117,7 +117,7 @@ def opened(
     trust: bool | None = None,
     environments: str | os.PathLike | None = None,
 ) -> tuple[Specification, Path]:
-    """A study and the folder of its results: `folder`; else the source, if it is a study's folder; else studies/NAME.
+    """A study and the folder of its results: `folder`, else the source, if it is a study's folder, else studies/NAME.
 
     Args:
         trust, environments: as for `specification`.
@@ -131,7 +131,7 @@ def opened(
 
 
 def status(source: Source, folder: str | os.PathLike | None = None) -> Status:
-    """The progress of a study, from its files; `remaining` is the last estimate of its runners."""
+    """The progress of a study, from its files. `remaining` is the last estimate of its runners."""
     study, directory = opened(source, folder)
     # Records of runs that are over
     errors, damaged, finished = {}, {}, 0
@@ -181,7 +181,7 @@ def _is_alive(record: Mapping[str, Any]) -> bool:
 
 
 def write_specification(study: Specification, folder: Path) -> None:
-    """Write the specification into the folder, so that it can be reported on alone; refuse a folder of another
+    """Write the specification into the folder, so that it can be reported on alone. Refuse a folder of another
     study."""
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / STUDY_FILE

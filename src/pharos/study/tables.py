@@ -53,8 +53,8 @@ class FinishedRuns:
     """Finished runs of a study, as tables.
 
     Attributes:
-        runs: a row for each run; see `table`.
-        points: a row for each evaluation; see `curves`.
+        runs: a row for each run, see `table`.
+        points: a row for each evaluation, see `curves`.
         damaged: what is wrong with results that cannot be read, by id.
     """
 
@@ -64,7 +64,7 @@ class FinishedRuns:
 
 
 def finished_runs(study: Specification, directory: Path) -> FinishedRuns:
-    """Read every finished run of a study once; one that cannot be read is named and left out.
+    """Read every finished run of a study once. A run that cannot be read is named and left out.
 
     Raises:
         ParameterError: no run is finished.
@@ -93,15 +93,17 @@ def finished_runs(study: Specification, directory: Path) -> FinishedRuns:
 
 
 def table(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataFrame":
-    """Table of the finished runs, a row each; runs with damaged files are left out, with a warning that names them.
+    """Table of the finished runs, a row each. Runs with damaged files are left out, with a warning that names them.
 
     Returns:
-        Columns `id`, `environment` (class), `instance`, `chance`, `agent`, `observation`, `seed`, `steps`, `seconds`,
-        `began` (date; "" if the record does not say);
-        the result of the run (`cumulative_regret`, `normalized_regret`, `value_optimal`, ...); `return`, the mean
-        return of the training episodes in the last tenth of the run, undiscounted; `exact`, whether every value behind
-        the regret is computed; and `half_width`, by how much `normalized_regret` may at worst be wrong if some are
-        estimated, 0 if none is.
+        A row has the columns
+
+        - `id`, `environment` (class), `instance`, `chance`, `agent`, `observation`, `seed`, `steps`, `seconds`
+        - `began`: date, or "" if the record does not say
+        - the result of the run: `cumulative_regret`, `normalized_regret`, `value_optimal`, ...
+        - `return`: mean undiscounted return of the training episodes in the last tenth of the run
+        - `exact`: whether every value behind the regret is computed
+        - `half_width`: by how much `normalized_regret` may at worst be wrong if some are estimated, 0 if none is
     Raises:
         ParameterError: no run is finished.
     """
@@ -114,7 +116,7 @@ def curves(source: Source, folder: str | os.PathLike | None = None) -> "pd.DataF
 
 
 def row_of(run: Run, record: Mapping[str, Any], curve: "pd.DataFrame", folder: Path) -> dict[str, Any]:
-    """The columns of `table` for one finished run, without its id; `folder` is named in errors."""
+    """The columns of `table` for one finished run, without its id. `folder` is named in errors."""
     row = {**described(run), "seconds": float(record["seconds"]), "began": _began(record)}
     row |= _result_of(record, folder) | {"return": _last_return(curve)}
     row["exact"], row["half_width"] = _exactness(curve, row)
@@ -134,7 +136,7 @@ def _warned(runs: FinishedRuns) -> FinishedRuns:
 
 
 def _result_of(record: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """The entries of a result that are one number or text each; NaN for null."""
+    """The entries of a result that are one number or text each, NaN for null."""
     result = {name: value for name, value in record["result"].items() if not isinstance(value, dict | list)}
     for name in RUN_NUMBERS:
         value = result.get(name, "nothing")
@@ -144,7 +146,7 @@ def _result_of(record: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def _began(record: Mapping[str, Any]) -> str:
-    """Date at which a run began: its record's date less the seconds of its program; "" if the record lacks it."""
+    """Date at which a run began: its record's date less the seconds of its program, or "" if the record lacks it."""
     try:
         seconds = float(record.get("batch", {}).get("seconds") or record["seconds"])
         began = datetime.strptime(record["written"], DATE).replace(tzinfo=UTC) - timedelta(seconds=seconds)
@@ -164,13 +166,17 @@ def _exactness(curve: "pd.DataFrame", row: Mapping[str, Any]) -> tuple[bool, flo
 
 
 def cells(rows: "pd.DataFrame", measures: "pd.DataFrame | None" = None) -> "pd.DataFrame":
-    """The means over seeds, a row for each cell; joined with hardness if `measures` (of `hardness_table`) is given.
+    """The means over seeds, a row for each cell, joined with hardness if `measures` (of `hardness_table`) is given.
 
     Returns:
-        Columns of the cell; `seeds`; `steps` (the most, if runs differ); means of `cumulative_regret`,
-        `normalized_regret`, `final_value`, `value_optimal`, `return`; `return_deviation` over seeds (population, as
-        0.00 is printed for equal runs; NaN for one seed); `exact`, whether all runs are; the mean of `half_width`; and
-        the measures.
+        A row has the columns
+
+        - of the cell
+        - `seeds`, and `steps` (the most, if runs differ)
+        - means of `cumulative_regret`, `normalized_regret`, `final_value`, `value_optimal`, `return`, `half_width`
+        - `return_deviation` over seeds: population, as 0.00 is printed for equal runs, NaN for one seed
+        - `exact`: whether all runs are
+        - the measures
     """
     values = ["cumulative_regret", "normalized_regret", "final_value", "value_optimal", "return"]
     groups = rows.groupby(CELL, sort=False)
@@ -223,12 +229,12 @@ def hardness_table(
     progress: Callable[[str], None] | None = None,
     tasks: Container[tuple[str, str]] | None = None,
 ) -> "pd.DataFrame":
-    """The measures of every instance under every kind of chance; computed once, and kept in the folder `hardness`.
+    """The measures of every instance under every kind of chance, computed once, and kept in the folder `hardness`.
 
     Args:
-        tasks: (instance, chance) of those that are wanted; None for all.
+        tasks: (instance, chance) of the tasks that you want. Default: all.
     Returns:
-        Columns `environment`, `instance`, `chance`; each measure as a number; `num_states`; and `notes`, which name a
+        Columns `environment`, `instance`, `chance`, each measure as a number, `num_states`, and `notes`, which name a
         measure if
 
         - it is undefined or unknown,
@@ -345,7 +351,7 @@ def _measure(
 def build_mdp(
     environment: str, parameters: Mapping[str, Any], chance: Mapping[str, float], gamma: float
 ) -> "TabularMDP":
-    """The tabular MDP of a run; its state space is built, or taken from the cache."""
+    """The tabular MDP of a run. Its state space is built, or taken from the cache."""
     from pharos.state_space import build
 
     mdp = build(make(environment, **parameters), progress=False).mdp(gamma=gamma)
@@ -391,7 +397,7 @@ def _key(parameters: Mapping[str, Any]) -> str:
 
 
 def paper_instance(environment: str, parameters: Mapping[str, Any]) -> int | None:
-    """The number of the instance among the blocks of its class in the paper's appendix C, counted from 1; None if not
+    """The number of the instance among the blocks of its class in the paper's appendix C, counted from 1. None if not
     there."""
     entry = _paper_instances().get((environment, _key(parameters)))
     return None if entry is None else entry[1]
@@ -413,19 +419,24 @@ def predict(
     """Return predictions for each cell of a study whose agent learns from observations: a row each.
 
     Args:
-        source, folder: as for `run`; no run is looked at.
+        source, folder: as for `run`. No run is looked at.
         blocks, agents, observations: a part of the study: numbers of blocks from 1, names of agents, and of
-            observations without their options; None: all.
-        primary: only the predictor that stands for each agent (`pharos.agents.Idealised`) with its table; other
-            columns are NaN, and `estimated_error` belongs to this predictor. A small part of the time.
+            observations without their options. Default: all.
+        primary: only the predictor that stands for each agent (`pharos.agents.Idealised`) with its table. Other columns
+            are NaN, and `estimated_error` belongs to this predictor. A small part of the time.
         progress: called with what is being done.
     Returns:
-        Columns `environment`, `instance`, `chance`, `agent`, `observation`; PREDICTORS; `network`; `estimated_error`,
-        the error of `kernel_regret` if landmarks stand for the kernel; `curve` and `adam_curve`, the learner's steps
-        and greedy regrets as JSON; `notes`, why a number is missing. The idealised learner has the steps of the run,
-        and of a DQN its discount, exploration and target network; of actor-critics, with the rollouts, steps and
-        discount of the agent, POLICY_PREDICTORS, `policy_curve` and `clipped_curve`, the curve of the distribution over
-        actions with PPO's clipping, NaN and "" in rows of others.
+        A row has the columns
+
+        - `environment`, `instance`, `chance`, `agent`, `observation`, PREDICTORS, `network`
+        - `estimated_error`: the error of `kernel_regret` if landmarks stand for the kernel
+        - `curve` and `adam_curve`: the learner's steps and greedy regrets as JSON
+        - of actor-critics POLICY_PREDICTORS, `policy_curve`, and `clipped_curve`, the curve of the distribution over
+          actions with PPO's clipping. NaN and "" in rows of others
+        - `notes`: why a number is missing
+
+        The idealised learner has the steps of the run, and of a DQN its discount, exploration and target network, of
+        an actor-critic its rollouts, steps and discount.
     Raises:
         ParameterError: the study has no such cell.
     Cost: measures of hardness are kept beside the state spaces, so that a second call is quick.

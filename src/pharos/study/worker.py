@@ -41,7 +41,7 @@ class HalfAsMany(str):
 
 
 def read_status(folder: Path) -> str | None:
-    """`finished` or `failed`; None if a run has no folder yet, or a damaged record."""
+    """`finished` or `failed`, or None if a run has no folder yet, or a damaged record."""
     try:
         record = run_record(folder)
     except FileFormatError:
@@ -50,7 +50,7 @@ def read_status(folder: Path) -> str | None:
 
 
 def run_record(folder: Path) -> dict[str, Any] | None:
-    """The record in run.json of a run; None if there is none.
+    """The record in run.json of a run, or None if there is none.
 
     Raises:
         FileFormatError: it is not the record of a run that is over. ResultCorrupted: it, or the curve of a finished
@@ -84,10 +84,10 @@ def attempt_run(
     again: Container[str] = (),
     resume: bool = False,
 ) -> list[str]:
-    """Execute the runs that are not over; return FINISHED, FAILED, BUSY (held by another process) or HalfAsMany for
+    """Execute the runs that are not over. Return FINISHED, FAILED, BUSY (held by another process) or HalfAsMany for
     each.
 
-    A run that raises is FAILED: its error stands in run.json and its log; those in `again` are repeated. With `resume`
+    A run that raises is FAILED: its error stands in run.json and its log. Runs in `again` are repeated. With `resume`
     the runner gets what an attempt that was killed left behind, else empty folders.
     """
     ends: dict[str, str] = {}
@@ -118,7 +118,7 @@ def attempt_run(
 
 
 def _execute(runner: BatchRunner, todo: Sequence[tuple[Mapping[str, Any], str, Path]], folder: Path) -> dict[str, str]:
-    """Call the runner, and put every run into its place, finished or failed; return HalfAsMany by id of the others."""
+    """Call the runner, and put every run into its place, finished or failed. Return HalfAsMany by id of the others."""
     began = time.perf_counter()
     first, *others = partials = [partial for _, _, partial in todo]
     with redirected_output(first / "log.txt"):
@@ -146,7 +146,7 @@ def _execute(runner: BatchRunner, todo: Sequence[tuple[Mapping[str, Any], str, P
 def run_alone(
     runner: Runner, configs: Sequence[Mapping[str, Any]], folders: Sequence[Path], _: Path
 ) -> Sequence[str | None]:
-    """Call a runner of single runs with a batch of one; with `functools.partial` a BatchRunner."""
+    """Call a runner of single runs with a batch of one. With `functools.partial` it is a BatchRunner."""
     runner(configs[0], folders[0])
     return [None]
 
@@ -158,7 +158,7 @@ def write_failure(folder: Path, config: Mapping[str, Any], id: str, error: str, 
 
 
 def publish_run(partial: Path, folder: Path, id: str) -> None:
-    """Move a run's folder to its place, on disk before it is there; an earlier failed attempt makes room."""
+    """Move a run's folder to its place, on disk before it is there. An earlier failed attempt makes room."""
     for path in partial.rglob("*"):
         if path.is_file():
             storage.sync(path)
@@ -218,7 +218,7 @@ def main(
     resume: bool,
     send: Callable[[tuple[list[str], str]], None],
 ) -> None:
-    """The body of a worker process; it sends the ids of runs that cannot be trained together, and why."""
+    """The body of a worker process. It sends the ids of runs that cannot be trained together, and why."""
     use_one_thread()
     try:
         ends = attempt_run(runner, configs, ids, folder, again=again, resume=resume)
@@ -231,7 +231,7 @@ def main(
 
 
 def use_one_thread() -> None:
-    """Set one thread for PyTorch, if it is loaded, and for Numba; a process per run keeps the processors busy."""
+    """Set one thread for PyTorch, if it is loaded, and for Numba. A process per run keeps the processors busy."""
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)
     if "numba" in sys.modules:

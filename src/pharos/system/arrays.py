@@ -7,7 +7,7 @@ five bytes of 255. NumPy has no such type: `PackedIndices` is an array of them t
 kernels/outcomes.py the same to compiled loops. docs/decisions/0017-indices-of-40-bits.md has the measurements.
 
 Outcomes: two layouts, two ways to keep probabilities, and one way to read (`OutcomeRows`). Row s A + a belongs to
-action a in state s. Nobody else asks which layout it is; kernels/outcomes.py says the same to compiled loops.
+action a in state s. Nobody else asks which layout it is. kernels/outcomes.py says the same to compiled loops.
 """
 
 from collections.abc import Callable, Iterator
@@ -19,6 +19,9 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from pharos.errors import ParameterError
+
+UNIT_ROUNDOFF = 2.0**-53
+"""Largest relative error of one rounding to 64-bit floats."""
 
 INT40 = "<i5"
 """What manifests call the type, after the names that NumPy gives to others."""
@@ -39,11 +42,11 @@ _ENTRIES_AT_ONCE = 1 << 20
 class PackedIndices:
     """An array of indices of 40 bits, which reads as one of int64: what is asked for is unpacked, and nothing else.
 
-    `indices[s]`, `indices[first:last]`, `indices[rows, columns]` are arrays of int64, or numbers; `np.asarray(indices)`
-    all of them, in 8 bytes each. Compiled loops read the entries without a copy.
+    `indices[s]`, `indices[first:last]`, `indices[rows, columns]` are arrays of int64, or numbers, and
+    `np.asarray(indices)` all of them, in 8 bytes each. Compiled loops read the entries without a copy.
 
     Attributes:
-        packed: the same, of type `PACKED`, in C order; may be a memory map.
+        packed: the same, of type `PACKED`, in C order. It may be a memory map.
         shape, ndim, size: of the array. dtype: int64, what its entries are read as. nbytes: what they take, 5 each.
     """
 
@@ -94,11 +97,11 @@ class PackedIndices:
         return f"PackedIndices(shape={self.shape})"
 
     def reshape(self, shape: int | tuple[int, ...], *others: int) -> "PackedIndices":
-        """The same entries in another shape; nothing is copied."""
+        """The same entries in another shape. Nothing is copied."""
         return PackedIndices(self.packed.reshape(shape if isinstance(shape, tuple) else (shape, *others)))
 
     def rows(self, start: int, stop: int) -> "PackedIndices":
-        """Entries [start, stop) of the first axis; nothing is copied."""
+        """Entries [start, stop) of the first axis. Nothing is copied."""
         return PackedIndices(self.packed[start:stop])
 
 
@@ -120,7 +123,7 @@ def unpacked(entries: np.ndarray) -> np.ndarray:
 
 
 def as_index_array(indices: object) -> Indices:
-    """Indices as an array of NumPy; `PackedIndices` stay as they are."""
+    """Indices as an array of NumPy. `PackedIndices` stay as they are."""
     return indices if isinstance(indices, PackedIndices) else np.asarray(indices)
 
 
@@ -128,7 +131,8 @@ T = TypeVar("T")
 
 
 def read_only(array: T) -> T:
-    """An array as kernels read it: a view that cannot be written to, so that all are of one type; all else as it is."""
+    """An array as kernels read it: a view that cannot be written to, so that all are of one type. All else stays as it
+    is."""
     if not isinstance(array, np.ndarray) or not array.flags.writeable:
         return array
     view = array.view()
@@ -196,12 +200,12 @@ class OutcomeRows:
     """Possible outcomes of executing actions, for S states, A actions and at most K outcomes of each pair.
 
     Attributes:
-        successors: (S, A, K) int32, int64 or `PackedIndices`; -1 if the episode ends; impossible outcomes repeat the
+        successors: (S, A, K) int32, int64 or `PackedIndices`. -1 if the episode ends. Impossible outcomes repeat the
             first one. Or (N,), the rows one after another.
-        offsets: (S A + 1,) index of the first entry of each row; None if successors are (S, A, K).
-        codes: (S, A) uint8 or uint16, which vector of the palette has the probabilities; None without a palette.
-        palette: (P, K) float64, the probabilities of possible outcomes in their order, then zeros; None without one.
-        probabilities: float64 in the shape of successors; None if there is a palette.
+        offsets: (S A + 1,) index of the first entry of each row. None if successors are (S, A, K).
+        codes: (S, A) uint8 or uint16, which vector of the palette has the probabilities. None without a palette.
+        palette: (P, K) float64, the probabilities of possible outcomes in their order, then zeros. None without one.
+        probabilities: float64 in the shape of successors. None if there is a palette.
     """
 
     NAMES = ("successors", "offsets", "codes", "palette", "probabilities")
@@ -299,7 +303,7 @@ class OutcomeCheck:
     """
 
     def __init__(self, stored: OutcomeRows, shape: tuple[int, int], most: int, least: int):
-        """Check the ends of the offsets and the palette; WrongOutcomes if they are wrong. shape: (S, A)."""
+        """Check the ends of the offsets and the palette. WrongOutcomes if they are wrong. shape: (S, A)."""
         self.stored, self.most, self.least = stored, most, least
         self.num_states, self.num_actions = shape
         offsets, size = stored.offsets, stored.successors.size
@@ -313,7 +317,7 @@ class OutcomeCheck:
         """(number of outcomes, next state of the first outcome) of each row of states [start, stop).
 
         Raises:
-            WrongOutcomes: they are no outcomes; the first row that is wrong is named.
+            WrongOutcomes: they are no outcomes. The first row that is wrong is named.
         """
         stored, rows, counts = self.stored, np.arange(start * self.num_actions, stop * self.num_actions), None
         # Codes: each names a vector of the palette, whose length is the number of outcomes
@@ -358,7 +362,7 @@ class OutcomeCheck:
         return counts, first
 
     def _sizes(self, probabilities: np.ndarray, name: str, source: Callable[[int], str]) -> np.ndarray:
-        """(R,) how many of the probabilities (R, K) of each row are not 0; they come first and sum to 1."""
+        """(R,) how many of the probabilities (R, K) of each row are not 0. They come first and sum to 1."""
         with np.errstate(invalid="ignore", over="ignore"):
             possible = probabilities > 0
             total = np.cumsum(probabilities, axis=1)[:, -1]

@@ -1,6 +1,6 @@
-"""The folder that keeps compiled code, so that it is compiled once; and the seconds of compiling, apart from work.
+"""The folder that keeps compiled code, so that it is compiled once, and the seconds of compiling, apart from work.
 
-`pharos.kernels` calls `prepare` as it is loaded; before that nothing can have been compiled.
+`pharos.kernels` calls `prepare` as it is loaded. Before that nothing can have been compiled.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ from pharos.system.storage import compiled_folders
 SMALL_STATES = 1 << 16
 """Entries below which rules and kernels are interpreted, as compiling takes longer (benchmarks/startup.py); 0: none."""
 
-TOLD_AFTER, TOLD_EVERY = 2.0, 10.0
+NOTICE_AFTER, NOTICE_EVERY = 2.0, 10.0
 """Seconds of compiling after which a line on standard error says so, and says so again."""
 
 announces = True
@@ -31,12 +31,12 @@ announces = True
 
 _lock = threading.Lock()
 _total, _running, _began = 0.0, 0, 0.0
-_next, _kernels = TOLD_AFTER, 0
+_next, _kernels = NOTICE_AFTER, 0
 _timer: threading.Timer | None = None
 
 
 def seconds() -> float:
-    """Seconds of wall-clock time in which this process has compiled so far; threads that compile at once count once."""
+    """Seconds of wall-clock time in which this process has compiled so far. Threads that compile at once count once."""
     with _lock:
         return _total + (time.perf_counter() - _began if _running else 0.0)
 
@@ -59,7 +59,7 @@ class Stopwatch:
 
 
 def prepare() -> None:
-    """Start the timing of what Numba compiles; loads Numba.
+    """Start the timing of what Numba compiles. Loads Numba.
 
     Raises:
         ParameterError: variables of the environment keep Numba from compiling.
@@ -72,7 +72,7 @@ def prepare() -> None:
         raise ParameterError(f"Numba cannot be loaded: {error}; look at its variables, NUMBA_...") from error
 
     class Compiling(event.Listener):
-        """Adds up the seconds of compiling; kernels that others call are compiled within them.
+        """Adds up the seconds of compiling. Kernels that others call are compiled within them.
 
         Meanwhile no garbage is sought, which was a tenth of compiling: it makes many objects, and all live until its
         end.
@@ -126,8 +126,8 @@ def _announce(name: str) -> None:
         if not _running:
             return
         now = _total + time.perf_counter() - _began
-        _next = now + TOLD_EVERY
-        _start_timer(TOLD_EVERY, name)
+        _next = now + NOTICE_EVERY
+        _start_timer(NOTICE_EVERY, name)
     outcome = "" if storage.is_cache_temporary() else "; kept for the next time"
     with contextlib.suppress(OSError, ValueError, AttributeError):  # of a stream that is closed, or None
         sys.stderr.write(f"pharos: compiling {name}, kernel {_kernels}, {now:.0f} s so far{outcome}\n")
@@ -142,7 +142,7 @@ def _name_of(function: Callable) -> str:
 
 @cache
 def private_folder(cache_directory: Path) -> Path | None:
-    """The folder of compiled code, which is this user's and which nobody else can write to; None if there is none.
+    """The folder of compiled code, which is this user's and which nobody else can write to. None if there is none.
 
     It is `compiled`, or, if several users share the cache, `compiled-` and the user's number. A warning says what is
     wrong with a folder that is refused.

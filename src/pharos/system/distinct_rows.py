@@ -23,15 +23,16 @@ COMPRESSION_LEVEL = 6
 
 
 class DistinctRows:
-    """N rows of one shape and type, of which only the distinct ones are kept; read like an array, a chunk at a time.
+    """N rows of one shape and type, of which only the distinct ones are kept. They are read like an array, a chunk at a
+    time.
 
     `rows[3]` and `rows[[3, 5]]` are fresh arrays.
 
     Attributes:
-        index: (N,) integers, the number of each row among the distinct ones; -1 for a row of zeros.
+        index: (N,) integers, the number of each row among the distinct ones, -1 for a row of zeros.
         shape: (N, *shape of a row). dtype: of the entries.
         num_distinct: D.
-        rows_in_chunk: distinct rows of a chunk; the last one may have fewer.
+        rows_in_chunk: distinct rows of a chunk. The last one may have fewer.
         name: of their file, for messages.
     Raises:
         FileFormatError: a chunk that is looked at is damaged.
@@ -130,7 +131,7 @@ class RowCollector:
         return len(self._numbers)
 
     def add(self, row: npt.ArrayLike, digest: str = "") -> int:
-        """Number of a row among the distinct ones; it is kept if it is new. digest: `row_digest(row)`, if known."""
+        """Number of a row among the distinct ones. It is kept if it is new. digest: `row_digest(row)`, if known."""
         array = np.ascontiguousarray(row, self.dtype)
         digest = digest or row_digest(array)
         number = self._numbers.get(digest)
@@ -154,7 +155,7 @@ class RowCollector:
         """Add what another collector had added since.
 
         Args:
-            chunks: that became full since; pending: `packed_pending` of then; digests: of the rows that were new.
+            chunks: that became full since. pending: `packed_pending` of that time. digests: of the rows that were new.
         Raises:
             ValueError: they do not fit.
         """

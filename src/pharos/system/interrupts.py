@@ -5,8 +5,8 @@ reference, such as locks of imports have, `__del__`, or one that C calls), in wh
 command would go on to exit code 0. So:
 
 - While the command loads, the process ends at once (`pharos/__init__.py`): nothing has begun.
-- While it works, KeyboardInterrupt is raised, so that locks and processes end in order; not within an import, whose end
-  is awaited, and once more if it was lost.
+- While it works, KeyboardInterrupt is raised, so that locks and processes end in order. Not within an import, whose end
+is awaited, and once more if it was lost.
 - When it has ended, the line is printed, what `atexit` has to clean up is cleaned up, and the exit code becomes 130.
 """
 
@@ -29,7 +29,7 @@ _AGAIN_SECONDS = 0.01
 
 
 class CommandInterrupts:
-    """Interrupts of the one command that this process runs; signals of other programs are left alone.
+    """Interrupts of the one command that this process runs. Signals of other programs are left alone.
 
     Attributes:
         is_active: whether `begin` was called, and interrupts are not ignored.
@@ -55,7 +55,7 @@ class CommandInterrupts:
         signal.signal(signal.SIGINT, self._on_interrupt)
 
     def finish(self) -> bool:
-        """Raise none any more, as the command has ended; whether there is one that was not raised."""
+        """Raise none any more, as the command has ended. Return whether there is one that was not raised."""
         self.is_over = self.is_active
         return self.is_pending
 
@@ -126,7 +126,7 @@ interrupts = CommandInterrupts()
 def time_limit(seconds: float | None, error: type[BaseException]) -> Iterator[None]:
     """Raise an error in the block after that many seconds of wall-clock time, and every second until the block ends.
 
-    A compiled kernel is not interrupted; it raises when it returns. Only the main thread can be stopped, by SIGALRM:
+    A compiled kernel is not interrupted. It raises when it returns. Only the main thread can be stopped, by SIGALRM:
     elsewhere, and on Windows, there is no limit.
 
     Args:

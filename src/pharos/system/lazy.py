@@ -1,6 +1,6 @@
-"""Lazy packages, which load a file when something in it is first used (PEP 562); and a conflict of installations.
+"""Lazy packages, which load a file when something in it is first used (PEP 562), and a conflict of installations.
 
-`import pharos` and a script's first lines need few of the names that a package publishes; the others cost nothing then.
+`import pharos` and a script's first lines need few of the names that a package publishes. The others cost nothing then.
 
 The distribution `pharos-rl` is this project. The distribution `pharos` is Graviti's SDK for pictures, whose files lie
 in the same folder if both are installed. The one installed last has replaced the other's `__init__.py`.
@@ -20,7 +20,7 @@ def attributes(package: str) -> Callable[[str], object]:
     Args:
         package: its `__name__`.
     Returns:
-        Function(name) -> what the module has under this name, which the package keeps; AttributeError for other names.
+        Function(name) -> what the module has under this name, which the package keeps. AttributeError for other names.
     """
 
     @functools.cache
@@ -52,10 +52,10 @@ FOREIGN_FILE = "__version__.py"
 
 
 def conflict(folder: Path | None = None) -> str | None:
-    """Message about the other project in the same folder, and how to mend it; None if it is not there.
+    """Message about the other project in the same folder, and how to mend it. None if it is not there.
 
     Args:
-        folder: of the package; None: of pharos.
+        folder: of the package. Default: of pharos.
     """
     folder = folder or Path(__file__).parents[1]
     if not (folder / FOREIGN_FILE).exists():

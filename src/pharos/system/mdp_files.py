@@ -120,7 +120,7 @@ def read_arrays(folder: str | os.PathLike, manifest: Mapping[str, Any]) -> dict[
 
 
 def write_rows(folder: Path, rows: DistinctRows) -> dict[str, Any]:
-    """Write the chunks of observations, one after another; returns what the manifest says of them."""
+    """Write the chunks of observations, one after another. Returns what the manifest says of them."""
     lengths, checksums = [], []
     with storage.replacing(folder / CHUNKS) as file:
         for number in range(rows.num_chunks):
@@ -139,7 +139,7 @@ def write_rows(folder: Path, rows: DistinctRows) -> dict[str, Any]:
 
 
 def read_observations(folder: str | os.PathLike, manifest: Mapping[str, Any]) -> np.ndarray | DistinctRows | None:
-    """Return the observations of the states; None if there are none. Chunks are read and checked when they are used.
+    """Return the observations of the states, or None if there are none. Chunks are read and checked when they are used.
 
     Raises:
         FileFormatError: they are missing, damaged or changed, also when a chunk is read.
@@ -229,7 +229,7 @@ def read_names(folder: str | os.PathLike, manifest: Mapping[str, Any]) -> dict[s
     """The names that a folder holds, or None.
 
     Returns:
-        `labels`, `variables`, `booleans` (of the variables), `choices`: lists of names; and under LABELS (S, labels)
+        `labels`, `variables`, `booleans` (of the variables), `choices`: lists of names. And under LABELS (S, labels)
         bool, VARIABLES (S, variables) integers and CHOICES (S, A) integers, if there are names of this kind.
     Raises:
         FileFormatError: an array is missing, damaged, changed, or does not fit.

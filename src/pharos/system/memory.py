@@ -57,7 +57,7 @@ def available_memory() -> int:
 
 
 def _groups() -> Iterator[tuple[Path, Path, Path]]:
-    """(limit, usage, statistics) of the groups of this process and those around them; the root, too, which may be a
+    """(limit, usage, statistics) of the groups of this process and those around them. The root, too, which may be a
     container's.
     """
     with contextlib.suppress(OSError, ValueError):
@@ -109,7 +109,7 @@ def reserved_states(num_words: int) -> np.ndarray:
 
 
 def reserved_table() -> np.ndarray:
-    """(N,) zero bytes of reserved address space, in which the table grows; empty if there is no address space."""
+    """(N,) zero bytes of reserved address space, in which the table grows. Empty if there is no address space."""
     for size in (1 << 35, 1 << 33, 1 << 31):
         with contextlib.suppress(OSError, ValueError):
             return huge_pages(size, np.dtype("|u1"))
@@ -288,7 +288,7 @@ def _mapping_of(array: np.memmap) -> mmap.mmap | None:
 
 
 def _advise(array: np.memmap, start: int, stop: int, advice: int | None) -> None:
-    """`madvise` on some rows of a mapped array: needed soon, so that the system reads them meanwhile; or not needed."""
+    """`madvise` on some rows of a mapped array: needed soon, so that the system reads them meanwhile, or not needed."""
     mapping = _mapping_of(array)
     if start < stop and isinstance(mapping, mmap.mmap) and advice is not None:
         row = array.strides[0]
@@ -332,7 +332,7 @@ def _make(path: Path, shape: tuple[int, ...], dtype: np.dtype) -> None:
 
 @contextlib.contextmanager
 def _locked(path: Path, file: BinaryIO, what: str) -> Iterator[contextlib.ExitStack]:
-    """Lock the file, by a claim beside it if the file system has no locks (`storage.lock`); yield that claim."""
+    """Lock the file, by a claim beside it if the file system has no locks (`storage.lock`). Yield that claim."""
     with contextlib.ExitStack() as claim:
         try:
             if fcntl is not None:
@@ -347,7 +347,7 @@ def _locked(path: Path, file: BinaryIO, what: str) -> Iterator[contextlib.ExitSt
 
 
 def _checked_offset(path: Path, file: BinaryIO, shape: tuple[int, ...], dtype: np.dtype, what: str) -> int:
-    """The byte of the file at which the array begins; FileFormatError if the file holds something else."""
+    """The byte of the file at which the array begins. FileFormatError if the file holds something else."""
     try:
         np.lib.format.read_magic(file)
         file_shape, is_fortran, file_dtype = np.lib.format.read_array_header_1_0(file)

@@ -22,7 +22,7 @@ SHOWN_LETTERS = 60  # letters of a wrong entry, in errors
 
 
 def docstring_entries(documented: object) -> dict[str, str]:
-    """Texts by name, of entries such as `height, width: of the grid` in the section Attributes or Args of a docstring;
+    """Texts by name, of entries such as `height, width: of the grid` in the section Attributes or Args of a docstring,
     also of the classes that a class extends.
     """
     texts: dict[str, str] = {}
@@ -113,7 +113,7 @@ def takes(cls: type, **defaults: object) -> Callable[[F], F]:
 
 
 def split_options(cls: type[T], options: Mapping[str, Any]) -> tuple[T, dict[str, Any]]:
-    """An object of the options that are fields of a dataclass or of its parts; and the other options."""
+    """An object of the options that are fields of a dataclass or of its parts, and the other options."""
     names = option_names(cls)
     own = {name: value for name, value in options.items() if name in names}
     return cls(**nested_options(cls, own)), {name: value for name, value in options.items() if name not in names}
@@ -123,12 +123,12 @@ def split_options(cls: type[T], options: Mapping[str, Any]) -> tuple[T, dict[str
 
 
 def parse_record(cls: type[T], entry: object, source: str, optional: Collection[str] = ()) -> T:
-    """An object of a dataclass from its entries; dataclasses among fields by their `from_dict`, or likewise.
+    """An object of a dataclass from its entries. Dataclasses among fields are made by their `from_dict`, or likewise.
 
-    A whole number is a number; no value is converted, so that digests of the entries stay what they are.
+    A whole number is a number. No value is converted, so that digests of the entries stay what they are.
 
     Args:
-        whose: the entries are, for errors.
+        source: what the entries belong to, for errors.
         optional: fields that may be left out.
     Raises:
         FileFormatError: an entry is missing, unknown or of another type.

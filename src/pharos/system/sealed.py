@@ -50,7 +50,8 @@ def write_sealed(
     *,
     follow: bool = False,
 ) -> None:
-    """Write a record and arrays, with their digests, to a file, replacing it atomically; same input, same bytes.
+    """Write a record and arrays, with their digests, to a file, replacing it atomically. The same input gives the same
+    bytes.
 
     Args:
         what: noun of the content, for errors.

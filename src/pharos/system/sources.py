@@ -61,7 +61,7 @@ class Source:
 
     @property
     def module(self) -> str | None:
-        """The name of the module; None for a file."""
+        """The name of the module, or None for a file."""
         where = self.name.rpartition(":")[0]
         return None if where.endswith(".py") else where
 
@@ -80,10 +80,10 @@ def is_reference(name: object) -> TypeGuard[str]:
 
 
 def find_source(name: str, folder: str | Path | None = None) -> Source:
-    """The source of `module:Name` or `file.py:Name`; nothing but the parents of the module is imported.
+    """The source of `module:Name` or `file.py:Name`. Nothing but the parents of the module is imported.
 
     Args:
-        folder: relative files and modules are looked for there first; None: in the current directory.
+        folder: relative files and modules are looked for there first. Default: the current directory.
     Raises:
         ParameterError: there is no such file or module.
     """
@@ -109,7 +109,7 @@ def find_source(name: str, folder: str | Path | None = None) -> Source:
 
 
 def load_source(source: Source) -> Any:
-    """Import what a source names; None if it has no such name. A file is executed again only if it has changed.
+    """Import what a source names. None if it has no such name. A file is executed again only if it has changed.
 
     Raises:
         ParameterError: it cannot be imported.
@@ -165,10 +165,10 @@ def resolve(source: Source, *, trust: bool = False, strict: bool = False) -> Any
 
 
 def source_of(value: object, attribute: str | None = None) -> Source | None:
-    """The source by which others can import a class or function; None if they cannot, as in a notebook.
+    """The source by which others can import a class or function. None if they cannot, as in a notebook.
 
     Args:
-        attribute: the name in its module; None: its own.
+        attribute: the name in its module. Default: its own.
     """
     name = getattr(value, "__module__", None)
     attribute = attribute or str(getattr(value, "__qualname__", "<none>"))
@@ -235,7 +235,7 @@ def _module_of_file(source: Source) -> ModuleType:
 
 
 def _module_called(source: Source) -> ModuleType:
-    """The module; its folder is searched first while it is imported."""
+    """The module. Its folder is searched first while it is imported."""
     name = source.module or ""
     module = sys.modules.get(name)
     if module is not None:
@@ -260,7 +260,7 @@ def _module_called(source: Source) -> ModuleType:
 
 
 def _checksum(file: str | Path) -> str:
-    """The digest of a file; empty if there is none."""
+    """The digest of a file, or empty if there is none."""
     from pharos.system.storage import digest_of_file  # which built-in classes do without
 
     return digest_of_file(file) if file and Path(file).is_file() else ""

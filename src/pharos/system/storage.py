@@ -64,7 +64,7 @@ def replacing(path: str | os.PathLike, *, durable: bool = True, follow: bool = F
         follow: whether it is a path that the user named: a link is followed, a pipe or a device written to.
         durable: the new file is on the disk before it has its name, and the name before this returns.
     Raises:
-        OSError: the file cannot be written; an older one of that name is then as it was.
+        OSError: the file cannot be written. An older one of that name is then as it was.
     """
     path = Path(path)
     if follow and _is_special(path):
@@ -93,18 +93,18 @@ def replacing(path: str | os.PathLike, *, durable: bool = True, follow: bool = F
 
 
 def replace_file(path: str | os.PathLike, data: bytes | str, *, durable: bool = True, follow: bool = False) -> None:
-    """Replace a file by these bytes, or by this text in UTF-8, in one step; see `replacing`."""
+    """Replace a file by these bytes, or by this text in UTF-8, in one step, see `replacing`."""
     with replacing(path, durable=durable, follow=follow) as file:
         file.write(data.encode() if isinstance(data, str) else data)
 
 
 def replace_json(path: str | os.PathLike, value: object, *, durable: bool = True) -> None:
-    """Replace a file by a value in JSON (see `json_text`), in one step; see `replacing`."""
+    """Replace a file by a value in JSON (see `json_text`), in one step, see `replacing`."""
     replace_file(path, json_text(value) + "\n", durable=durable)
 
 
 def replace_array(path: str | os.PathLike, array: object, *, follow: bool = False) -> None:
-    """Replace a file by an array as .npy, in one step; see `replacing`.
+    """Replace a file by an array as .npy, in one step, see `replacing`.
 
     NumPy writes to a real file by C's `fwrite` and does not notice a full disk at its end, so it gets no real file
     here.
@@ -123,7 +123,7 @@ class _Writer:
 
 
 def inside(root: Path, *names: str) -> Path:
-    """The path of a folder within a folder of results; a symbolic link on the way below `root` is removed."""
+    """The path of a folder within a folder of results. A symbolic link on the way below `root` is removed."""
     path = root
     for name in names:
         path = path / name
@@ -139,7 +139,7 @@ def own_file(path: str, flags: int) -> int:
     return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0), 0o666)
 
 
-def check_name(name: str, whose: str = "name") -> str:
+def check_name(name: str, context: str = "name") -> str:
     """Return a name that is fit for a file: at most 128 letters, digits and `._-`, and a letter or digit first.
 
     Raises:
@@ -147,7 +147,7 @@ def check_name(name: str, whose: str = "name") -> str:
     """
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{,127}", name):
         raise ParameterError(
-            f"{whose} is {name[:60]!r}; expected at most 128 letters, digits and ._-, and a letter or a digit first"
+            f"{context} is {name[:60]!r}; expected at most 128 letters, digits and ._-, and a letter or a digit first"
         )
     return name
 
@@ -246,7 +246,7 @@ def _host() -> str:
 
 
 def _is_alive(process: int) -> bool:
-    """Whether a process of this machine is alive; True if that is unknown."""
+    """Whether a process of this machine is alive. True if that is unknown."""
     if os.name == "nt":
         return True
     try:
@@ -271,7 +271,7 @@ def lock(folder: Path, error: type[PharosError] = FolderLocked, activity: str = 
 
     If the file system has no such locks (ENOSYS, ENOLCK, EOPNOTSUPP: Lustre without `-o flock`, some network file
     systems), the folder is held by a file `lock.claim` that only one process can make. It says who made it. One whose
-    process is gone is removed by the next process of the same machine; from another machine nobody can tell, so the
+    process is gone is removed by the next process of the same machine. From another machine nobody can tell, so the
     error names the file.
 
     Args:
@@ -314,7 +314,7 @@ def _is_at(path: Path, file: TextIO) -> bool:
 def waiting_lock(
     folder: Path, error: type[PharosError], activity: str, on_wait: Callable[[str], Any]
 ) -> contextlib.ExitStack:
-    """Hold a folder as `lock` does, waiting while another process holds it; `tell` is called once, with a line.
+    """Hold a folder as `lock` does, waiting while another process holds it. `on_wait` is called once, with a line.
 
     Returns:
         A context in which the folder is held, already entered: `with waiting_lock(...):`.
@@ -332,7 +332,7 @@ def waiting_lock(
 
 
 def _flock(file: TextIO, folder: Path, error: type[PharosError], activity: str) -> bool:
-    """Take the lock; False if the file system has none."""
+    """Take the lock. False if the file system has none."""
     if fcntl is None:
         return False
     try:
@@ -354,7 +354,7 @@ def has_no_locks(problem: OSError) -> bool:
 
 @contextlib.contextmanager
 def hold_claim(path: Path, error: type[PharosError], activity: str) -> Iterator[None]:
-    """Hold the folder of `path` by making that file, which only one process can; see `lock`."""
+    """Hold the folder of `path` by making that file, which only one process can, see `lock`."""
     folder = path.parent
     mine = f"{_holder()}, {uuid.uuid4().hex}"
     for _ in range(CLAIM_ATTEMPTS):
@@ -376,7 +376,7 @@ def hold_claim(path: Path, error: type[PharosError], activity: str) -> Iterator[
 
 
 def _create(path: Path, text: str) -> bool:
-    """Make a file that is not there; False if it is."""
+    """Make a file that is not there. False if it is."""
     try:
         descriptor = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644)
     except FileExistsError:
@@ -461,7 +461,7 @@ def check_regular(path: str | os.PathLike) -> None:
     Every reader of a file that somebody else may have written calls it before the file is opened.
 
     Raises:
-        OSError: it is none, or there is nothing; `strerror` says so.
+        OSError: it is none, or there is nothing, as `strerror` says.
     """
     try:
         is_regular = stat.S_ISREG(os.stat(path).st_mode)
@@ -498,7 +498,7 @@ def read_json(path: str | os.PathLike, error: type[PharosError] = FileFormatErro
 
 
 def digest_of_json(value: object) -> str:
-    """XXH3-128 of a value as compact JSON with sorted keys; NaN and infinity are null."""
+    """XXH3-128 of a value as compact JSON with sorted keys. NaN and infinity are null."""
     text = json.dumps(plain(value), sort_keys=True, separators=(",", ":"), allow_nan=False)
     return xxhash.xxh3_128_hexdigest(text.encode())
 
@@ -544,7 +544,7 @@ class ResultCache:
         return self.folder / f"{xxhash.xxh3_64_hexdigest(json.dumps(dependencies, sort_keys=True).encode())}.json"
 
     def get(self, dependencies: Mapping[str, Any]) -> dict[str, Any] | None:
-        """The entries of a result; None if there is none, or if its file was changed."""
+        """The entries of a result. None if there is none, or if its file was changed."""
         try:
             record = read_json(self.file(dependencies))
             entries = record.get("task", record)  # as values of 0.1.0 have it

@@ -9,7 +9,7 @@ _pool: tuple[int, ThreadPoolExecutor] | None = None  # of this process: threads 
 
 
 def in_blocks(run: Callable[[int, int], None], number: int, block: int) -> None:
-    """run(first, last) over 0 .. number - 1; on all processors if there are at least two blocks."""
+    """run(first, last) over 0 .. number - 1, on all processors if there are at least two blocks."""
     if number < 2 * block:
         run(0, number)
         return

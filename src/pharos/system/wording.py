@@ -1,4 +1,4 @@
-"""Texts of counts, names and errors in messages and tables; and the templates of pages."""
+"""Texts of counts, names and errors in messages and tables, and the templates of pages."""
 
 import traceback
 from functools import cache
@@ -37,7 +37,7 @@ def in_one_line(error: BaseException) -> str:
 
 
 def line_in(error: BaseException, file: str | None) -> str:
-    """The last line of a file in the traceback of an error, such as " (FILE, line 12)"; empty if there is none."""
+    """The last line of a file in the traceback of an error, such as " (FILE, line 12)", or empty if there is none."""
     frames = [each for each in traceback.extract_tb(error.__traceback__) if file and each.filename == file]
     return f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
 

@@ -56,8 +56,8 @@ class Workers:
     block are ended.
 
     Args:
-        preload: modules that one process loads, from which the others are forked, if the system can do that; none
-            (or None): each begins anew.
+        preload: modules that one process loads, from which the others are forked, if the system can do that. With none
+            (or None) each begins anew.
         groups: whether processes that one of them starts, and leaves behind, are killed when it has ended.
     """
 
@@ -78,7 +78,7 @@ class Workers:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Terminate the processes; kill those that take too long."""
+        """Terminate the processes. Kill those that take too long."""
         processes = [process for process, _ in self._running.values()]
         self._running.clear()
         for process in processes:
@@ -97,7 +97,7 @@ class Workers:
         """Start a process that calls function(*arguments, send), where `send(message)` makes an event here.
 
         Args:
-            definitions: classes and functions that it needs; see `without_main`.
+            definitions: classes and functions that it needs, see `without_main`.
         Raises:
             EOFError, ConnectionError: the process from which it is to be forked is gone.
         """
@@ -154,7 +154,7 @@ class Workers:
                 os.killpg(leader, signal.SIGKILL)
 
     def kill(self, key: str) -> None:
-        """Kill a process; its end is an event."""
+        """Kill a process. Its end is an event."""
         self._running[key][0].kill()
 
 
@@ -166,9 +166,9 @@ def _work(
     announces: bool,
     leads: bool,
 ) -> None:
-    """The body of a process; `environment` are the variables of the one that started it, now.
+    """The body of a process. `environment` are the variables of the one that started it, now.
 
-    They may have changed since the process from which others are forked was started; Numba refuses that the number of
+    They may have changed since the process from which others are forked was started. Numba refuses that the number of
     threads changes.
 
     Args:
@@ -197,7 +197,7 @@ def _work(
 
 
 def end_cleanly() -> None:
-    """Leave interrupts to the process that started this one; on SIGTERM, raise Terminated, so that `finally` runs.
+    """Leave interrupts to the process that started this one. On SIGTERM, raise Terminated, so that `finally` runs.
 
     A process that SIGTERM kills leaves its semaphores behind, of which Python then warns.
     """

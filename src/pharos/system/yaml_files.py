@@ -27,12 +27,12 @@ Loader.add_implicit_resolver(
 
 
 def read_yaml(path: Path, error: type[PharosError] = ParameterError) -> object:
-    """The data in a file; `error`, one line that names file and line, if it is no YAML that pharos reads."""
+    """The data in a file. Raises `error`, one line that names file and line, if it is no YAML that pharos reads."""
     return nodes_and_data(read_text(path, error), str(path), error)[1]
 
 
 def read_text(path: Path, error: type[PharosError] = ParameterError) -> str:
-    """The text of a file; a pipe or a device is refused before it is opened."""
+    """The text of a file. A pipe or a device is refused before it is opened."""
     try:
         check_regular(path)
         return path.read_text(encoding="utf-8")
@@ -43,7 +43,7 @@ def read_text(path: Path, error: type[PharosError] = ParameterError) -> str:
 
 
 def nodes_and_data(text: str, name: str, error: type[PharosError] = ParameterError) -> tuple["yaml.Node | None", Any]:
-    """(root node, data) of a text in YAML; both None for an empty one. Raises `error`, which begins with `name`."""
+    """(root node, data) of a text in YAML, both None for an empty one. Raises `error`, which begins with `name`."""
     try:
         root = yaml.compose(text, Loader)
         if root is not None:
@@ -64,7 +64,7 @@ def nodes_and_data(text: str, name: str, error: type[PharosError] = ParameterErr
 def _check_nodes(root: "yaml.Node", name: str) -> None:
     """Refuse what no file needs: keys that are no words or repeated, nodes within themselves, millions by aliases.
 
-    A node that aliases share is looked at once; its size counts at each alias.
+    A node that aliases share is looked at once. Its size counts at each alias.
     """
     sizes: dict[int, int] = {}
 

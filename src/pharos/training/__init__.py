@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from pharos.regret import ReferenceValues, cumulative_expected_regret, regret
     from pharos.training.batch import train_group
     from pharos.training.budget import (
+        MOST_ERROR_LETTERS,
         BudgetSpent,
         CountedEnv,
         Learn,

@@ -7,7 +7,7 @@ steps.
 
 A run alone is a batch of one. A run does not depend on who else is in its batch, so nothing does on how runs are
 grouped, and what was killed goes on from its last checkpoint to the bytes that it gives undisturbed. What is finished
-is not trained again; a run that fails is said to have failed, and the others go on.
+is not trained again. A run that fails is said to have failed, and the others go on.
 """
 
 import contextlib
@@ -60,9 +60,9 @@ def train_group(
 
     Args:
         runs: none of which was trained before, each with its index.
-        checkpoints: folder for checkpoints of programs; None: none are written.
+        checkpoints: folder for checkpoints of programs. None: none are written.
         report: called with each evaluation and each end.
-        lane: the most runs in a program; None: all that fit together.
+        lane: the most runs in a program. Default: all that fit together.
         is_single: whether the run is the only one of its call.
         raises: whether errors of runs are raised, and not written down if the run cannot begin.
         tensorboard: whether TensorBoard's logs are written into the folder of a run.
@@ -156,7 +156,8 @@ def _is_foreign(config: RunConfig, runs: Sequence[PreparedRun]) -> bool:
 
 
 class Program:
-    """Runs under one loop: trained, evaluated, resumed, and brought into their folders; arguments as `train_group`."""
+    """Runs under one loop: trained, evaluated, resumed, and brought into their folders. Arguments are the same as for
+    `train_group`."""
 
     learner: Learner  # from when the runs begin; gone if they failed
     evaluators: Evaluators | None = None  # if policies are evaluated apart
@@ -231,13 +232,13 @@ class Program:
 
     @property
     def _folder(self) -> Path | None:
-        """The folder for checkpoints of a batch; None for a run alone, or if none are written."""
+        """The folder for checkpoints of a batch. None for a run alone, or if none are written."""
         if self.is_alone or self.checkpoints is None:
             return None
         return self.checkpoints / digest_of_json([run.id for run in self.runs])[:16]
 
     def _is_finished(self) -> bool:
-        """Lock the folder of a run alone; return whether another process has finished it meanwhile."""
+        """Lock the folder of a run alone. Return whether another process has finished it meanwhile."""
         folder, index = self.runs[0].folder, self.runs[0].index
         if folder is None or index is None:
             return False
@@ -251,7 +252,7 @@ class Program:
         return done is not None
 
     def _checkpoint(self) -> Checkpoint | None:
-        """The checkpoint of the group; None if it has no folder, if it cannot be resumed, or if another process trains
+        """The checkpoint of the group. None if it has no folder, if it cannot be resumed, or if another process trains
         the same batch.
         """
         if not hasattr(self.learner, "save"):
@@ -344,7 +345,8 @@ class Program:
     def _add(
         self, counts: Counts, values: Values, policies: Sequence[PolicyLike | Evaluation] = ()
     ) -> dict[int, dict[str, Any]]:
-        """Add a row to the curve of each run that has not failed; return them by its index in the group."""
+        """Add a row to the curve of each run that has not failed. Return the rows by the index of the run in the
+        group."""
         rows: dict[int, dict[str, Any]] = {}
         step, episodes, returns = counts
         for i, run in enumerate(self.runs):
@@ -363,7 +365,7 @@ class Program:
         return rows
 
     def _publish(self, seconds: float, compiled: float) -> None:
-        """Write and keep the result of each run; its seconds are its share of the seconds of the batch."""
+        """Write and keep the result of each run. Its seconds are its share of the seconds of the batch."""
         size = {"runs": len(self.runs), "seconds": seconds, "device": self.runs[0].tasks.device}
         share = seconds - compiled if self.is_alone else seconds / len(self.runs)
         entries: dict[str, Any] = {"compiling_seconds": compiled} if self.is_alone else {"batch": size}

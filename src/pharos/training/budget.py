@@ -10,8 +10,8 @@ A policy is a function from a batch of N observations to (N,) actions or (N, A) 
 so that what it is made of may change afterwards: one forward pass for all states, some thousand observations. An agent
 that yields about as often as it is evaluated, every `steps` / 15 steps, loses nothing by yielding more often.
 
-At an evaluation point the policy counts that was yielded last, at that step or before; none yet: uniform play. The end
-of the generator, and `BudgetSpent`, are the end of training; its last policy counts from there on.
+At an evaluation point the policy counts that was yielded last, at that step or before. Before the first, uniform play
+counts. The end of the generator, and `BudgetSpent`, are the end of training. Its last policy counts from there on.
 
 Every copy of the environment counts against the same budget, or refuses to be made or stepped (`CountedEnv`). So a run
 without a single counted step cannot have learnt: if its policy is better or worse than uniform play, it is refused.
@@ -44,7 +44,7 @@ from pharos.training.task import Task
 
 RECORDER_BLOCK = 4096  # observations that a policy is asked about at once
 MOST_STATES_ASKED = 100_000  # states that it is asked about in advance
-MOST_LETTERS = 500  # letters of an agent's error
+MOST_ERROR_LETTERS = 500  # letters of an agent's error
 KEPT = 1 << 28  # bytes of observations that are kept between snapshots
 UNIFORM_TOLERANCE = 1e-9  # of normalised regret: as far from uniform play a policy without a step may be, by rounding
 IGNORED = 1000
@@ -85,12 +85,12 @@ class StepBudget:
 
     Attributes:
         limit: steps that may be taken. interval: between evaluation points.
-        steps, episodes, returns: taken; finished; the sum of the returns of finished ones, without noise and delay.
+        steps: taken so far. episodes: finished so far. returns: the sum of their returns, without noise and delay.
         at: episodes and returns at the evaluation points so far.
         refused: steps that were asked for when none was left.
         after_end: steps between the end of an episode and the next reset.
         same_seeds: resets with the seed of the reset before.
-        give_up: called instead of refusing once more when IGNORED steps were refused; it does not return.
+        give_up: called instead of refusing once more when IGNORED steps were refused. It does not return.
         process: the one that counts. lock: held during a step.
     """
 
@@ -136,7 +136,8 @@ class CountedEnv(gymnasium.Wrapper):
     pickled, nor be used in another process than the one that made it: nobody would count there.
 
     `info` has nothing of what an agent is to learn: neither the state nor its index, neither the executed action nor
-    what was earned without noise; INFO is what is left. Episodes begin in the start states of the task: `reset` takes
+        what was earned without noise. INFO is what is left. Episodes begin in the start states of the task: `reset`
+        takes
     no options.
     """
 
@@ -175,11 +176,11 @@ class CountedEnv(gymnasium.Wrapper):
         )
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset as in Gymnasium; a first reset without a seed takes the seed of the run.
+        """Reset as in Gymnasium. A first reset without a seed takes the seed of the run.
 
         Raises:
-            ParameterError: it was made in another process; or it was just reset with the seed before, as a vector
-                environment does in which one environment stands several times; or it has options.
+            ParameterError: it was made in another process, or it has options. Or it was just reset with the seed
+                before, as a vector environment does in which one environment stands several times.
         """
         self.budget.check_process()
         if options:
@@ -228,16 +229,16 @@ def _public(info: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class Snapshots:
-    """Policies of a task as tables; each policy is queried about all states at once."""
+    """Policies of a task as tables. Each policy is queried about all states at once."""
 
     def __init__(self, task: Task):
         self.task = task
         self._kept: list[tuple[int, Any]] | None = None
         self._num_checked = 0
 
-    def taken(self, policy: PolicyLike) -> PolicyLike | Evaluation:
-        """The current policy as (S, A) probabilities; or its value if it sees more than the state, or there are too
-        many states.
+    def evaluate(self, policy: PolicyLike) -> PolicyLike | Evaluation:
+        """The current policy as (S, A) probabilities. Its value instead if it sees more than the state, or there are
+        too many states.
 
         Raises:
             ParameterError: it raises, it answers something else than actions or probabilities, or one of the first
@@ -282,7 +283,7 @@ class Snapshots:
 def _answer(
     answers: PolicyAnswers, policy: PolicyLike, observations: np.ndarray | dict[str, np.ndarray], count: int
 ) -> np.ndarray:
-    """(N, A) probabilities; ParameterError, one line that says what was asked, for an error in the policy's code."""
+    """(N, A) probabilities. ParameterError, one line that says what was asked, for an error in the policy's code."""
     try:
         return answers.answer(observations, count)
     except PharosError:
@@ -315,12 +316,12 @@ class PolicyRecorder:
 
     Args:
         task: of the run.
-        steps: that may be taken. interval: between evaluation points; the last one is the end.
+        steps: that may be taken. interval: between evaluation points. The last one is the end.
         seed: of the environment.
     Attributes:
         env: the environment. budget: its steps so far.
         count: policies so far.
-        in_force: the policy of the points to come, a table or its value; uniform play before the first.
+        in_force: the policy of the points to come, a table or its value. Uniform play before the first.
         ended: finished episodes, and the sum of their returns, at the point that was passed last.
         at_point: called at each point.
     """
@@ -348,7 +349,7 @@ class PolicyRecorder:
         if self.count and not self.budget.steps:
             raise not_stepped(self.budget.limit)
         self.pass_points(self.budget.steps)
-        self.in_force = self._snapshots.taken(policy)
+        self.in_force = self._snapshots.evaluate(policy)
         if not self.count:
             self._first_step = self.budget.steps
         self.count += 1
@@ -442,10 +443,10 @@ def generated_curve(learn: Learn, task: Task, *, steps: int, evaluations: int, s
     """Train with a generator, and evaluate the policy in force at each evaluation point, and uniform play before.
 
     Returns:
-        A row before the first step, for uniform play, and one for each point; and the number of counted steps.
+        A row before the first step, for uniform play, and one for each point. Also the number of counted steps.
     Raises:
-        ParameterError: it is no generator of policies; or it has a second policy, or ends with another one than uniform
-            play, when no step was counted; or whatever its code raises.
+        ParameterError: it is no generator of policies. Or it has a second policy, or ends with another one than uniform
+            play, when no step was counted. Or whatever its code raises.
     """
     recorder = PolicyRecorder(task, steps=steps, interval=steps // evaluations, seed=seed)
     generate(learn, recorder, seed)
@@ -466,7 +467,7 @@ def end_process(agent: str, limit: int) -> NoReturn:
 def errors_in_one_line(agent: str, file: str | None) -> Iterator[None]:
     """Raise PharosError, which names the agent and the line of its file, for what its code raises, SystemExit included.
 
-    file: with the code of the agent; errors that do not pass through it are raised as they are, such as a full disk.
+    file: with the code of the agent. Errors that do not pass through it are raised as they are, such as a full disk.
     """
     try:
         yield
@@ -475,12 +476,13 @@ def errors_in_one_line(agent: str, file: str | None) -> Iterator[None]:
     except BaseException as error:
         if not (line := line_in(error, file)):
             raise
-        text = capped(in_one_line(error).rstrip(": "), MOST_LETTERS)
+        text = capped(in_one_line(error).rstrip(": "), MOST_ERROR_LETTERS)
         raise PharosError(f"agent {agent} raised {text}{line}") from error
 
 
 def generate(learn: Callable[..., Any], recorder: PolicyRecorder, seed: int) -> None:
-    """Train with a generator, and record its policies until it, or its budget, has ended; raises as `generated_curve`.
+    """Train with a generator, and record its policies until it, or its budget, has ended. Errors are the same as for
+    `generated_curve`.
 
     After a refused step one more policy counts. A generator that yields IGNORED policies in a row without a step is
     refused, or, if its budget is spent, has ended.

@@ -1,4 +1,4 @@
-"""Values of learnt policies, of one or of a batch at once; and the curves that runs write of them.
+"""Values of learnt policies, of one or of a batch at once, and the curves that runs write of them.
 
 A row of a curve has the exact value of the policy at an evaluation, and the regret of the episodes before it.
 """
@@ -54,23 +54,23 @@ def evaluate_agent(
     """Return the value of an agent's current policy on a task.
 
     Args:
-        agent: has `policy_table()` (S,), (S, A) or as `pharos.evaluate_policy` takes it; or
-            `action_probabilities(observations)` -> (N, A); or is a model of Stable-Baselines3; or an array like the
-            table; or a function of observations that returns (N, A) probabilities or (N,) actions; or one with a
-            memory: `initial_state(n)` and `(observations, state, starts)` -> (probabilities or actions, next state),
-            the state an array or nested tuples of arrays whose first axis is n. It is asked in histories.
+        agent: an object with `policy_table()` (S,), (S, A) or as `pharos.evaluate_policy` takes it, or with
+            `action_probabilities(observations)` -> (N, A). Or a model of Stable-Baselines3, an array like the table, or
+            a function of observations that returns (N, A) probabilities or (N,) actions. Or an agent with a memory:
+            `initial_state(n)` and `(observations, state, starts)` -> (probabilities or actions, next state), the state
+            an array or nested tuples of arrays whose first axis is n. It is asked in histories.
         deterministic: whether the most probable action is taken (the first among equals) instead of one at random.
         masks: the actions that a model trained under masks (MaskablePPO) may choose, (S, A) bool by the states of
             `task.space`, or a function from states (N, D) to (N, A) bool.
-        max_states: how many states (pairs, if previous actions matter; histories, of a memory) the policy may
+        max_states: how many states (pairs, if previous actions matter, histories for a memory) the policy may
             reach for an exact value.
         episodes, seed: of the estimate beyond that.
         again: whether more policies of the task will be evaluated: what they share is remembered. Changes no value.
             Policies of vectors under chance are then asked in blocks about all states that any policy reaches, if
             these are few enough, else about the states that they reach, step by step.
     Returns:
-        Its `Evaluation`; with the `gain` if the objective of the task is the average reward: if the policy reaches more
-        than `max_states`, between the gains of the worst and the best policy.
+        Its `Evaluation`, with the `gain` if the objective of the task is the average reward. If the policy reaches more
+        than `max_states`, the gain lies between the gains of the worst and the best policy.
     Raises:
         ParameterError: the agent is none of these, its answers are no probabilities, or it was trained on other
             observations, behind a VecNormalize that is not with it, or under masks that are not given.
@@ -96,7 +96,7 @@ def evaluate_agent(
 
 
 def joint_values(batch: Learner, runs: "Sequence[PreparedRun]") -> dict[int, Evaluation]:
-    """Values of policies by index in the batch, if computing them at once costs less; others are left out.
+    """Values of policies by index in the batch, if computing them at once costs less. Others are left out.
 
     These are policies of DQN if nothing is random, and of runs that share a task of few states and see one frame.
     If gains are measured, too, each policy is evaluated alone.
@@ -155,7 +155,7 @@ def _values_of_tables(batch: Learner, task: Task, indices: Sequence[int]) -> dic
         for i in list(tables):
             try:
                 tables[i].append(answers[i].answer(observations, len(states)))
-            except PharosError:  # which it will be told when it is evaluated alone
+            except PharosError:  # the error is reported when the run is evaluated alone
                 del tables[i]
     if not tables:
         return {}
@@ -176,7 +176,7 @@ class Curve:
     Attributes:
         table: the policy of the last row, if it is a table.
         counted_steps: of the environment, if it counts them itself (`pharos.benchmark`).
-        policies: facts on the policies, see `policy_facts`; empty if nobody asked for them.
+        policies: facts on the policies, see `policy_facts`. Empty if nobody asked for them.
     """
 
     task: Task
@@ -195,7 +195,7 @@ class Curve:
         evaluation: Evaluation | None = None,
     ) -> dict[str, Any]:
         """Add the row of the policy after `step` steps and `episodes` finished episodes, whose returns sum to
-        `returns`; the policy is evaluated unless its `evaluation` is there.
+        `returns`. The policy is evaluated unless its `evaluation` is there.
         """
         if evaluation is None and agent is self.table:
             evaluation = self._evaluation
@@ -281,7 +281,7 @@ def policy_facts(task: Task, tables: Sequence[np.ndarray | None], regrets: Seque
     """Facts on the policies of a run, at its evaluations.
 
     Args:
-        tables: policy of each evaluation, (S, A) probabilities; None if it is no table.
+        tables: policy of each evaluation, (S, A) probabilities. None if it is no table.
         regrets: normalised, of each as it is played.
     Returns:
         Empty if a policy is no table, else `one_action`: share of states in which the last policy prefers the same

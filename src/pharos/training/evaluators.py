@@ -68,13 +68,13 @@ class Evaluators:
             self.senders.append(sender)
 
     def begin(self) -> None:
-        """Begin to evaluate the present policies; the values of those before have been fetched."""
+        """Begin to evaluate the present policies. The values of earlier ones have been fetched."""
         for part, sender in zip(self.parts, self.senders, strict=True):
             with contextlib.suppress(BrokenPipeError):  # `values` finds that the process has ended
                 sender.send([self.learner.parameters(i) for i in part])
 
     def values(self) -> dict[int, Evaluation | PharosError]:
-        """Values of the policies by run, or why they have none; waits for them. PharosError: a process has ended."""
+        """Values of the policies by run, or why they have none. Waits for them. PharosError: a process has ended."""
         values: dict[int, Evaluation | PharosError] = {}
         while len(values) < sum(map(len, self.parts)):
             for key, event in self.workers.events():

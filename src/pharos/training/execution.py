@@ -47,19 +47,19 @@ Work = tuple[Callable[..., Any], Sequence[Any], Sequence[object]]
 
 
 class Execution(Generic[R]):
-    """Groups of runs that wait, are trained, and end; a subclass says what a run is, and which folder its result is in.
+    """Groups of runs that wait, are trained, and end. A subclass says what a run is, and which folder its result is in.
 
     Args:
         groups: runs that one process trains.
-        pool: of processes; None: they are trained in this one.
+        pool: of processes. None: they are trained in this one.
         workers: most processes at a time.
-        checkpoints: folder for checkpoints of programs of several runs; None: none are written.
+        checkpoints: folder for checkpoints of programs of several runs. None: none are written.
         timeout: seconds for each run, after which it has failed.
-        attempts: GROUP_ATTEMPTS; 1 for a pool that begins again itself.
+        attempts: GROUP_ATTEMPTS, or 1 for a pool that begins again itself.
     Attributes:
         waiting: (the earliest time to begin, runs). running: key of the process -> (runs, when it began).
         lost_servers: how often in a row the process that forks workers was gone.
-        exit_busy: exit code of a process whose runs another process trains; None: nobody else is at them.
+        exit_busy: exit code of a process whose runs another process trains. None: nobody else is at them.
         is_divisible: whether a group whose process was killed too often is halved.
     """
 
@@ -93,11 +93,11 @@ class Execution(Generic[R]):
         raise NotImplementedError
 
     def is_over(self, run: R, *, ended: bool = False) -> bool:
-        """Whether there is a result, or the reason why not; `ended`: the process that trained it has just ended."""
+        """Whether there is a result, or the reason why not. `ended`: the process that trained it has just ended."""
         raise NotImplementedError
 
     def receive(self, key: str, message: tuple[Any, ...]) -> None:
-        """Take a message of the work; whatever else comes from a pool is the end of a process."""
+        """Take a message of the work. Whatever else comes from a pool is the end of a process."""
         raise NotImplementedError
 
     def fail(self, run: R, reason: str) -> None:
@@ -128,7 +128,7 @@ class Execution(Generic[R]):
         """Let the halves of runs that cannot be trained together begin anew, before all others.
 
         Args:
-            key: of the process that has, or had, them. reason: told once; empty if each run will say it.
+            key: of the process that has, or had, them. reason: reported once. Empty if each run will say it.
         """
         if key in self.running:
             group, leaving = self.running[key][0], {id(run) for run in runs}
@@ -178,7 +178,7 @@ class Execution(Generic[R]):
             self.pool.start(key, function, arguments, needs)
 
     def _lose_server(self, error: Exception) -> None:
-        """Wait a little for another process that forks workers, as it is gone; PharosError after LOST_SERVERS times."""
+        """Wait a little for another process that forks workers, as it is gone. PharosError after LOST_SERVERS times."""
         self.lost_servers += 1
         if self.lost_servers > LOST_SERVERS:
             raise PharosError(
@@ -206,10 +206,10 @@ class Execution(Generic[R]):
                 self.pool.kill(key)
 
     def _end(self, key: str, code: int | str) -> None:
-        """Count the results of a process that has ended; its other runs wait again.
+        """Count the results of a process that has ended. Its other runs wait again.
 
         Args:
-            code: exit code; or, of other pools, why it has died.
+            code: exit code, or, of other pools, why it has died.
         """
         group, _ = self.running.pop(key)
         left = [run for run in group if not self.is_over(run, ended=code in (0, self.exit_busy))]
@@ -228,7 +228,7 @@ class Execution(Generic[R]):
         return f"its process ended {how}{f', {self.attempts} times' * (self.attempts > 1)}; {advice}"
 
     def _repeat(self, key: str, group: list[R], reason: str) -> None:
-        """Let runs without results wait again, up to `attempts` times; then halve them, or let a single run fail."""
+        """Let runs without results wait again, up to `attempts` times. Then halve them, or let a single run fail."""
         for run in group:
             self.kills[id(run)] += 1
         most = max((self.kills[id(run)] for run in group), default=0)
@@ -263,7 +263,7 @@ class TrainingProgress:
 
     Attributes:
         done, total: environment steps of all runs together.
-        rows: of the curves, by the index of the run among the configurations; of this evaluation alone.
+        rows: of the curves, by the index of the run among the configurations, of this evaluation alone.
         finished, failed: numbers of runs.
     """
 
@@ -289,20 +289,20 @@ def train_configs(
     workers: int = 1,
     seconds: Sequence[float] | None = None,
 ) -> list[TrainingResult | FailedRun]:
-    """Train a run for each configuration; runs of the batched engine that fit together train as one program.
+    """Train a run for each configuration. Runs of the batched engine that fit together train as one program.
 
     Args:
-        folders: of the runs, one for each; None: nothing is written. Finished runs there are returned.
-        checkpoints: folder for checkpoints of whole batches; None: none are written. A batch that was killed goes on
+        folders: of the runs, one for each. None: nothing is written. Finished runs there are returned.
+        checkpoints: folder for checkpoints of whole batches. None: none are written. A batch that was killed goes on
             from there with the runs that it had.
-        progress: called after each evaluation; what it raises ends the training and is raised here.
-        tasks: makes tasks, with values that are known already, and code of the user's own if it is trusted; None:
+        progress: called after each evaluation. What it raises ends the training and is raised here.
+        tasks: makes tasks, with values that are known already, and code of the user's own if it is trusted. None:
             from scratch, trusting none.
-        device: "cpu" or "cuda"; None: the tasks' device, and "cpu" if there are none.
-        lane: the most runs in a batch; None: all that fit together. Changes no result.
-        workers: processes that share the runs, lane by lane, if there are folders; what they learn is in these
-            alone. They trust the code that the configurations name. Changes no result.
-        seconds: that each run takes, in any unit, by which they are shared out; None: all take as long.
+        device: "cpu" or "cuda". Default: the tasks' device, and "cpu" if there are none.
+        lane: the most runs in a batch. Default: all that fit together. Changes no result.
+        workers: processes that share the runs, lane by lane, if there are folders. What they learn is in these alone.
+            They trust the code that the configurations name. Changes no result.
+        seconds: that each run takes, in any unit, by which they are shared out. Default: all take as long.
     Returns:
         The result of each run, or why it has none.
     Raises:
@@ -363,7 +363,7 @@ class Training(Execution[PreparedRun]):
         super().__init__(prepared, pool, workers=len(groups), checkpoints=checkpoints)
 
     def results_in_order(self) -> list[TrainingResult | FailedRun]:
-        """Train all runs; return their results in the order of the configurations."""
+        """Train all runs, and return their results in the order of the configurations."""
         try:
             self.execute()
         except CallbackError as stop:
@@ -407,7 +407,7 @@ class Training(Execution[PreparedRun]):
         self.results[run.index] = FailedRun(run.config.to_dict(), run.folder, error)
 
     def _report(self, rows: Mapping[int, Mapping[str, Any]]) -> None:
-        """Call the progress function; CallbackError for what it raises, which is not an error of the runs."""
+        """Call the progress function. CallbackError for what it raises, which is not an error of the runs."""
         if self.progress is None:
             return
         failed = sum(isinstance(end, FailedRun) for end in self.results.values())

@@ -1,4 +1,4 @@
-"""Learners of agents that are functions: a generator of policies, a function of JAX; see `pharos.agents.registry`.
+"""Learners of agents that are functions: a generator of policies, a function of JAX, see `pharos.agents.registry`.
 
 Neither is resumed: a run that was killed begins anew, and ends with the same bytes if its function has chance by its
 seed alone.
@@ -14,8 +14,8 @@ is compiled. `snapshots` are parameters: a tree of arrays whose first axis has K
 ..., `steps` steps. `apply(parameters, observations)` gives (N, A) probabilities or (N,) actions. Observations of all
 states are one batch, so that a policy is one forward pass.
 
-At an evaluation point the snapshot counts that was taken last, at that step or before; none yet: uniform play. Steps
-are not counted here, nor are episodes: that a function takes `steps` steps can be read in its code alone.
+At an evaluation point the snapshot counts that was taken last, at that step or before. Before the first, uniform play
+counts. Steps are not counted here, nor are episodes: that a function takes `steps` steps can be read in its code alone.
 """
 
 import math
@@ -65,8 +65,8 @@ class GeneratorLearner(PolicyRecorder):
         """Train until the generator ends or its budget is spent, and call `at_point` at each point.
 
         Raises:
-            ParameterError: it is no generator; or it has a second policy, or ends with another one than uniform play,
-                when no step was counted; or yields very many policies without a step while it has some.
+            ParameterError: it is no generator, or it has a second policy, or ends with another one than uniform play,
+                when no step was counted. Or it yields very many policies without a step while it has some.
             PharosError: its code raises something, SystemExit included.
         """
         self.at_point = at_point
@@ -92,7 +92,7 @@ class GeneratorLearner(PolicyRecorder):
 
 
 class CompiledLearner:
-    """Learner of runs of one task: a function of JAX, one program for all seeds; neither steps nor episodes count."""
+    """Learner of runs of one task: a function of JAX, one program for all seeds. Neither steps nor episodes count."""
 
     def __init__(self, runs: Sequence[Any], learn: Callable[..., Any]):
         self.runs, self.function = runs, learn
@@ -149,7 +149,7 @@ def compiled_curves(
         episodes in it.
     Raises:
         MissingExtra: JAX or gymnax is not installed.
-        ParameterError: the task is none of tables alone; or the function returns something else.
+        ParameterError: the task is none of tables alone, or the function returns something else.
     """
     context = task.observer.observe
     lacking = [

@@ -25,7 +25,7 @@ class TrainingOptions:
         agent: q_learning, dqn, ppo, a2c, module:Class for Stable-Baselines3, or module:learn. Files of one's own are
             `file.py:Class` and `file.py:learn`.
         observation: vector, simple_image, complex_image, one_hot, index, number, hash, recorded, or your own. That is
-            `module:name` or `file.py:name`; tables see the index of the state.
+            `module:name` or `file.py:name`. Tables see the index of the state.
         observation_options: option of the observation, such as size=natural.
         chance: of acting, and in how rewards are paid. Values, returns and regret are of what is earned.
         hyperparameters: hyperparameter of the agent, such as learning_rate=0.001. These go before what
@@ -34,9 +34,9 @@ class TrainingOptions:
         steps: steps to learn from.
         gamma: discount of values and returns. The agent's own discount is a hyperparameter.
         horizon: steps of an episode in values and returns, as `Horizon.of` reads it.
-        objective: total: values and regret of the total reward, gamma 1 without a horizon; average: the curve also has
+        objective: total: values and regret of the total reward, gamma 1 without a horizon. average: the curve also has
             the average reward of a step in the long run, and its regret.
-        evaluation_interval: steps between evaluations; a hundredth when not given.
+        evaluation_interval: steps between evaluations. Default: a hundredth of the steps.
         engine: sb3 (Stable-Baselines3), or batched: many seeds as one program. The latter is pharos' own DQN and PPO.
     """
 
@@ -60,11 +60,11 @@ class ExecutionOptions:
     Attributes:
         shard: only the I-th of N parts, such as 1/8. So N machines share a folder.
         retry_failed: execute failed runs again.
-        resume: killed runs go on from their last checkpoint; their results may then differ. That is for long runs on
+        resume: killed runs go on from their last checkpoint. Their results may then differ. That is for long runs on
             machines that come and go: a deep agent then ends elsewhere than without the interruption. Else killed runs
             start anew, and results never depend on it.
         timeout: seconds after which a run is ended, and failed. A batch gets as many for each of its runs.
-        workers: processes; as many as processors when not given, one on a GPU, whose memory they would share.
+        workers: processes. Default: as many as processors, one on a GPU, whose memory they would share.
         device: of batches: cpu or cuda. As torch names it.
         block: of this block alone, from 1. Again for another one.
         agent: of this agent alone. Again for another one.

@@ -1,7 +1,7 @@
-"""The folder of a run: record and checkpoints while it is trained; result and agent once it is finished.
+"""The folder of a run: record and checkpoints while it is trained, result and agent once it is finished.
 
 run.json and curve.csv are each written whole or not at all, with digests. Nothing is pickled. Earlier runs have their
-curve in curve.parquet, with the same columns, values to the last bit and digest; it is read.
+curve in curve.parquet, with the same columns, values to the last bit and digest. It is read.
 """
 
 import contextlib
@@ -79,9 +79,9 @@ def versions() -> dict[str, str]:
 
 
 def write_record(folder: Path, record: Mapping[str, Any]) -> None:
-    """Replace run.json in one step; numbers that JSON cannot say are null.
+    """Replace run.json in one step. Numbers that JSON cannot say are null.
 
-    The record gets a `digest` of all that it says; the record of a finished run also has `checksums` of the other files
+    The record gets a `digest` of all that it says. The record of a finished run also has `checksums` of the other files
     of the run, which are written before it: of `curve.csv` (see `digest_of_curve`), and of what the agent has learnt;
     and `written`, the date.
     """
@@ -92,7 +92,7 @@ def write_record(folder: Path, record: Mapping[str, Any]) -> None:
 
 
 def write_curve(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Replace curve.csv in one step; the same rows give the same bytes.
+    """Replace curve.csv in one step. The same rows give the same bytes.
 
     Numbers are the shortest decimals that mean the same float64.
     """
@@ -149,7 +149,7 @@ def read_record(folder: str | os.PathLike) -> dict[str, Any]:
 
 
 def read_curve(folder: str | os.PathLike, *, columns: Iterable[str] = tuple(CURVE_COLUMNS)) -> "pd.DataFrame":
-    """Return the evaluations of a run, a row each; see `read_curve_table`."""
+    """Return the evaluations of a run, a row each, as `read_curve_table` does."""
     curve = _read_curve(Path(folder), columns)
     if isinstance(curve, dict):
         import pandas as pd
@@ -176,7 +176,7 @@ def read_curve_table(folder: str | os.PathLike, columns: Iterable[str] = tuple(C
 
 
 def read_rows(folder: str | os.PathLike, columns: Iterable[str] = tuple(CURVE_COLUMNS)) -> list[dict[str, Any]]:
-    """Return the evaluations of a run, a dictionary each, as `read_curve_table`; curve.csv needs no pyarrow."""
+    """Return the evaluations of a run, a dictionary each, as `read_curve_table`. curve.csv needs no pyarrow."""
     curve = _read_curve(Path(folder), columns)
     if isinstance(curve, dict):
         values = (column.tolist() for column in curve.values())
@@ -252,7 +252,7 @@ def check_agent_files(folder: Path) -> None:
 
 
 def write_table(path: Path, table: "pa.Table", *, follow: bool = False) -> None:
-    """Replace a Parquet file in one step, with checksums of its pages; see `storage.replacing`."""
+    """Replace a Parquet file in one step, with checksums of its pages, see `storage.replacing`."""
     import pyarrow.parquet as pq
 
     with storage.replacing(path, follow=follow) as file:
@@ -263,7 +263,7 @@ def read_table(path: Path, advice: str = RUN_AGAIN) -> "pa.Table":
     """Read a Parquet file, and compare its pages with their checksums.
 
     Raises:
-        FileFormatError: there is no such file. ResultCorrupted: it cannot be read; the message ends with the advice.
+        FileFormatError: there is no such file. ResultCorrupted: it cannot be read. The message ends with the advice.
         MissingExtra: pyarrow is not installed.
     """
     if not _has_pyarrow():
@@ -286,7 +286,7 @@ def digest_of_curve(table: "pa.Table") -> str:
     """XXH3-128 of the columns of a curve, whatever their order or the version of Parquet that holds them.
 
     For each column, by name: its name, type and number of rows, and its values as little-endian int64, float64 (NaN
-    if there is none) or bytes of truth; of other types as JSON.
+    if there is none) or bytes of truth. Other types are JSON.
     """
     return _digest_of_columns(_columns_of(table))
 
@@ -351,7 +351,7 @@ class TrainingResult:
         config: of the run.
         result: summary: values of the optimal, uniform, worst and final policy, regrets, episodes.
         curve: a row for each evaluation, a dictionary with the columns of curve.csv.
-        agent: the trained agent: a `QLearning` or a model of Stable-Baselines3; None if the run was finished before.
+        agent: the trained agent: a `QLearning` or a model of Stable-Baselines3. None if the run was finished before.
         folder: of the run, or None.
         seconds: time that it took, without compiling.
         notes: sentences on what looks like a mistake of a function of the user's own, by kind.
@@ -373,7 +373,7 @@ class TrainingResult:
 
 
 def finished_result(folder: Path, config: RunConfig) -> TrainingResult | None:
-    """The result in a folder; None if there is none; ParameterError if it belongs to another run."""
+    """The result in a folder, or None if there is none. ParameterError if it belongs to another run."""
     if not (folder / "run.json").exists():
         return None
     record = read_record(folder)
@@ -453,7 +453,7 @@ class Checkpoint:
         self._next = now + max(RUN_CHECKPOINT_SECONDS, (now - began) / SHARE_OF_TIME if RUN_CHECKPOINT_SECONDS else 0.0)
 
     def restore(self, learner: Learner) -> tuple[list[Any], float] | None:
-        """(rows of the curve, seconds spent) of the last checkpoint, from which the learner goes on; or None.
+        """(rows of the curve, seconds spent) of the last checkpoint, from which the learner goes on, or None.
 
         Raises:
             FileFormatError: it was changed after it was written.

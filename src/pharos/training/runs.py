@@ -1,8 +1,8 @@
-"""Training an agent on a task, with the exact regret of its policy at chosen steps; runs that are killed resume.
+"""Training an agent on a task, with the exact regret of its policy at chosen steps. Runs that are killed resume.
 
     FOLDER/run.json         configuration, versions, status, result
     FOLDER/curve.csv        a row for each evaluation
-    FOLDER/checkpoint/      while it runs: what the next attempt goes on from; arrays, JSON and tensors, never code
+    FOLDER/checkpoint/      while it runs: what the next attempt goes on from: arrays, JSON and tensors, never code
 
 A run that is killed goes on from its last checkpoint when it is started again: at most the last interval between
 evaluations is lost (or the last ten seconds, if intervals are shorter). Without interruption the same seed gives the
@@ -43,19 +43,19 @@ def train(
     """Train an agent, and measure the exact regret of its policy as it learns.
 
     Args:
-        agent: "q_learning", "dqn", "ppo", "a2c"; or "module:Name" or "file.py:Name" of an algorithm for
-            Stable-Baselines3, or of a function learn(env, steps, seed) that yields policies; or such a class or
+        agent: "q_learning", "dqn", "ppo", "a2c". Or "module:Name" or "file.py:Name" of an algorithm for
+            Stable-Baselines3, or of a function learn(env, steps, seed) that yields policies. Or such a class or
             function itself.
         environment: a name, with its parameters as keywords, or an Environment.
         seed: decides everything random.
-        out: folder of the run; None: nothing is written. A finished run there is returned, an unfinished one resumed.
+        out: folder of the run. None: nothing is written. A finished run there is returned, an unfinished one resumed.
         tensorboard: write TensorBoard's logs into `out`/tensorboard (algorithms of Stable-Baselines3).
         progress: called after each evaluation with steps done, steps in all, and the row of the curve.
         options: of `TrainingOptions`: steps, observation, observation_options, sticky, random, lazy, reward_noise,
-            reward_delay, gamma, horizon, objective, evaluation_interval, hyperparameters, engine; and the parameters of
+            reward_delay, gamma, horizon, objective, evaluation_interval, hyperparameters, engine, and the parameters of
             the environment.
     Raises:
-        ParameterError: an option is wrong, or `out` holds another run. UnknownName: no such name; the nearest is
+        ParameterError: an option is wrong, or `out` holds another run. UnknownName: no such name. The nearest is
             suggested.
         MissingExtra: Stable-Baselines3 is not installed.
     """
@@ -82,17 +82,17 @@ def train_many(
     Args:
         seeds: of the runs, each another.
         device: of the batched engine: "cpu" or "cuda".
-        workers: processes that share the runs, lane by lane, if there is a folder for results; runs that train alone
+        workers: processes that share the runs, lane by lane, if there is a folder for results. Runs that train alone
             stay in one. Results do not depend on it.
-        out: a folder, in which each run has its own, seed-0 and so on; None: nothing is written. Finished runs there
+        out: a folder, in which each run has its own, seed-0 and so on. None: nothing is written. Finished runs there
             are returned, and what was killed goes on from its last checkpoint.
         progress: called after each evaluation.
-        options: as for `train`. The engine is "batched" unless told otherwise, if it has the agent: all runs as one
-            program (dqn, ppo, and q_learning one after the other); "sb3": one after the other.
+        options: as for `train`. The engine is "batched" by default, if it has the agent: all runs as one program (dqn,
+            ppo, and q_learning one after the other). With "sb3" they train one after the other.
     Returns:
-        The result of each run in the order of the seeds; a run that failed says why, and does not stop the others.
+        The result of each run in the order of the seeds. A run that failed says why, and does not stop the others.
     Raises:
-        ParameterError: no seed, or one twice; or as `train`. AllRunsFailed: none has a result.
+        ParameterError: no seed, one seed twice, or as for `train`. AllRunsFailed: none has a result.
     """
     numbers = [int(seed) for seed in seeds]
     if not numbers or len(set(numbers)) != len(numbers):
@@ -125,7 +125,7 @@ def train_config(
     trust: bool = False,
     strict: bool = False,
 ) -> TrainingResult:
-    """Train as a configuration says, the `config` of a run.json or of a study; results go into `folder`.
+    """Train as a configuration says, the `config` of a run.json or of a study. Results go into `folder`.
 
     Args:
         values: at the start of the task, if they are known already.
@@ -148,7 +148,7 @@ def _train(
     progress: RunProgress | None,
     tensorboard: bool = False,
 ) -> TrainingResult:
-    """Train a single run; its errors are raised."""
+    """Train a single run. Its errors are raised."""
     if tensorboard and (folder is None or not agent_called(config.agent).has_tensorboard(config.engine)):
         raise ParameterError(
             f"TensorBoard's logs were asked for, with {config.agent}, the engine {config.engine} and "
@@ -173,7 +173,7 @@ def _train(
 def _runs(
     environment: Environment | str, options: Mapping[str, Any], seeds: Sequence[int]
 ) -> tuple[Task, list[RunConfig]]:
-    """The task, and the configuration of a run with each of the seeds; `options` as `train` takes them."""
+    """The task, and the configuration of a run with each of the seeds. `options` are the same as for `train`."""
     training, parameters = split_options(TrainingOptions, options)
     agent, hyperparameters, table = training.agent, training.hyperparameters, options.get("hyperparameters")
     name = agent_called(agent).observation(training.observation)

@@ -31,7 +31,7 @@ TASK_ENTRIES = (
     *("environment", "parameters", "chance", "observation", "observation_options", "gamma", "horizon", "objective"),
     "sources",
 )
-SEEN = ("environment", "parameters", "observation", "observation_options", "sources")
+OBSERVED_FIELDS = ("environment", "parameters", "observation", "observation_options", "sources")
 
 
 def plan(
@@ -42,7 +42,7 @@ def plan(
     Args:
         workers: most processes.
         device: on which networks are trained.
-        seconds: that each run takes, in any unit; None: all take as long.
+        seconds: that each run takes, in any unit. Default: all take as long.
     """
     if workers < 2 or len(configs) < 2:
         return [list(range(len(configs)))]
@@ -56,7 +56,7 @@ def lanes(keys: Sequence[Hashable | None], widths: Sequence[int]) -> list[list[i
     """Return the lanes of runs, in the order of their first run.
 
     Args:
-        keys: runs with equal keys fit together; None: a run is alone.
+        keys: runs with equal keys fit together. None: a run is alone.
         widths: most runs of the lane that a run begins.
     """
     groups: list[list[int]] = []
@@ -97,7 +97,7 @@ class Shapes:
         self._shapes: dict[str, RunShape] = {}
 
     def key(self, config: RunConfig) -> Hashable | None:
-        """Key of a run; runs with equal keys fit together. None: it is alone, or something is wrong with it."""
+        """Key of a run. Runs with equal keys fit together. None: it is alone, or something is wrong with it."""
         try:
             return agent_called(config.agent).group_key(_Sizes(config, self), self.device)
         except Exception:  # the error is reported when the run begins
@@ -108,9 +108,9 @@ class Shapes:
         return agent_called(config.agent).width(_Sizes(config, self), self.device)
 
     def shape(self, config: RunConfig) -> RunShape:
-        """The sizes of a run; the sizes of an observation that needs states, or cannot be made, are not known."""
+        """The sizes of a run. The sizes of an observation that needs states, or cannot be made, are not known."""
         entry = config.to_dict()
-        key = json.dumps([entry.get(name) for name in SEEN], sort_keys=True)
+        key = json.dumps([entry.get(name) for name in OBSERVED_FIELDS], sort_keys=True)
         if key not in self._shapes:
             self._shapes[key] = _run_shape(config, key)
         return self._shapes[key]
@@ -170,7 +170,7 @@ class FailedRun:
 
 
 class TaskCache:
-    """Tasks of runs by configuration; they share spaces, rewards, solved values and observations.
+    """Tasks of runs by configuration. They share spaces, rewards, solved values and observations.
 
     Args:
         values: config -> values at the start of its task, if they are known.
@@ -190,7 +190,7 @@ class TaskCache:
         self._shared: dict[str, Any] = {}
 
     def task(self, config: RunConfig) -> Task:
-        """The task of a run, the same object for all runs on it; tasks share spaces and rewards."""
+        """The task of a run, the same object for all runs on it. Tasks share spaces and rewards."""
         return self.shared("task", config, TASK_ENTRIES, lambda: self._task(config))
 
     def adopt(self, config: RunConfig, task: Task) -> None:
@@ -205,7 +205,7 @@ class TaskCache:
         return task
 
     def world(self, config: RunConfig, task: Task) -> tuple[StateSpace, TabularMDP]:
-        """The states of a task, and their MDP without chance and horizon; the same for all tasks of a world."""
+        """The states of a task, and their MDP without chance and horizon, the same for all tasks of a world."""
         return self.shared("world", config, WORLD, lambda: (task.space, task.space.mdp(gamma=task.gamma)))
 
     def shared(self, what: str, config: RunConfig, names: Sequence[str], make: Callable[[], T]) -> T:
@@ -222,9 +222,9 @@ class PreparedRun:
     """A run before and while it is trained: a `pharos.agents.LearningRun`, with its curve and its record.
 
     Attributes:
-        index: among the configurations; None for a run of a checkpoint that nobody asks for.
+        index: among the configurations. None for a run of a checkpoint that nobody asks for.
         tasks: that it shares with other runs.
-        key: runs with equal keys train together, see `pharos.agents.Agent.prepare`; None: it is alone, has checkpoints
+        key: runs with equal keys train together, see `pharos.agents.Agent.prepare`. None: it is alone, has checkpoints
             in its own folder, and holds that.
         error: why it has failed.
     """
@@ -294,6 +294,6 @@ class PreparedRun:
         write_record(self.folder, record)
 
     def fail(self, error: Exception) -> None:
-        """Mark the run as failed; the reason is kept in run.json."""
+        """Mark the run as failed. The reason is kept in run.json."""
         self.error = error
         self.write("failed", error=in_one_line(error))

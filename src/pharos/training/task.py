@@ -44,8 +44,8 @@ class Horizon:
     """The number of steps of an episode in values and returns: a number, the environment's time limit, or none.
 
     Attributes:
-        value: a number of steps; "limit": the time limit of the environment; "none": discounted values without a
-            horizon, or total rewards with gamma 1.
+        value: a number of steps, "limit" for the time limit of the environment, or "none" for discounted values without
+            a horizon, or total rewards with gamma 1.
     """
 
     value: int | str = "limit"
@@ -71,7 +71,7 @@ class Horizon:
         )
 
     def steps(self, env: Environment) -> int | None:
-        """The number of steps in an environment; None for discounted values without a horizon."""
+        """The number of steps in an environment, or None for discounted values without a horizon."""
         if self.value == "none":
             return None
         return int(env.max_episode_steps if self.value == "limit" else self.value)
@@ -112,16 +112,16 @@ class Task:
 
     Attributes:
         env: the environment.
-        chance: of acting, and in how agents are paid; its fields are keywords too, `Task(env, sticky=0.1)`. Values and
+        chance: of acting, and in how agents are paid. Its fields are keywords too, `Task(env, sticky=0.1)`. Values and
             regret count the rewards without noise and delay.
         observation, observation_options: what the agent sees, as `pharos.observe` takes it.
         previous_action: whether the agent also sees the previously executed action.
         gamma: discount of values and returns.
-        horizon: number of steps of an episode in values and returns, as `Horizon.of` reads it; "default": the
+        horizon: number of steps of an episode in values and returns, as `Horizon.of` reads it. "default": the
             environment's time limit.
-        objective: "average": policies are also measured by what a step earns in the long run; "total" stands for
+        objective: "average": policies are also measured by what a step earns in the long run. "total" stands for
             gamma 1 without a horizon, and None for values alone.
-        values: at the start, if they are known already; None: solved for when they are needed.
+        values: at the start, if they are known already. None: solved for when they are needed.
     """
 
     env: Environment
@@ -168,7 +168,7 @@ class Task:
 
     @property
     def horizon_steps(self) -> int | None:
-        """Steps of an episode in values and returns; None for discounted values or total rewards without a horizon."""
+        """Steps of an episode in values and returns. None for discounted values or total rewards without a horizon."""
         return self.horizon  # type: ignore[return-value]  # __post_init__ has resolved it
 
     @property
@@ -229,7 +229,7 @@ class Task:
         return {}
 
     def reach(self, max_rows: int, steps: int) -> ReachableRows:
-        """Rows that policies of positive probability reach, remembered; see `pharos.policies.reachable_rows`."""
+        """Rows that policies of positive probability reach, remembered, see `pharos.policies.reachable_rows`."""
         key = max_rows, steps
         if key not in self._reaches:
             self._reaches[key] = reachable_rows(self.measured, *key, sees_previous_action=self.previous_action)
@@ -319,7 +319,7 @@ class Task:
 
 
 def _range_of_returns(mdp: TabularMDP) -> tuple[float, float]:
-    """The lowest and the highest return of an episode, whichever outcomes are drawn; each pays what its action pays on
+    """The lowest and the highest return of an episode, whichever outcomes are drawn. Each pays what its action pays on
     average, as episodes on a table do.
     """
     largest = max(abs(mdp.reward_table.lowest), abs(mdp.reward_table.highest))
@@ -361,16 +361,16 @@ class RunConfig(TrainingOptions):
         environment: name of the class of environments.
         parameters: all parameters of the environment, JSON-able.
         seed: of everything random.
-        horizon: number of steps of an episode in values and returns; None: discounted values without a horizon, or
+        horizon: number of steps of an episode in values and returns. None: discounted values without a horizon, or
             total rewards if gamma is 1.
-        objective: "average", of runs that also measure what a step earns in the long run; else None, and not in `id`
-            and `to_dict`.
+        objective: "average", of runs that also measure what a step earns in the long run. Otherwise None, and not in
+            `id` and `to_dict`.
         evaluation_interval: steps between evaluations of the policy.
         hyperparameters: of the agent, which go before its defaults.
-        engine: what trains networks, one of ENGINES. Tables are the same with each, so theirs is always "sb3"; `id` and
+        engine: what trains networks, one of ENGINES. Tables are the same with each, so theirs is always "sb3". `id` and
             `to_dict` have it only if it is another.
         sources: the origin of a class, observation or agent of the user's own, under "environment", "observation"
-            and "agent". Their names belong to the `id`; files and checksums do not.
+            and "agent". Their names belong to the `id`, files and checksums do not.
     """
 
     environment: str
@@ -403,7 +403,7 @@ class RunConfig(TrainingOptions):
         hyperparameters: Mapping[str, Any] | None = None,
         engine: str = "sb3",
     ) -> "RunConfig":
-        """The configuration of a run on a task; it is evaluated every hundredth of `steps` unless told otherwise.
+        """The configuration of a run on a task. It is evaluated every hundredth of `steps` by default.
 
         Args:
             agent: `module:Name` and `file.py:Name` are looked for in the current directory.
@@ -470,7 +470,7 @@ class RunConfig(TrainingOptions):
         """The environment of the run.
 
         Args:
-            trust: whether code of the user's own may be imported; what was imported before needs no trust.
+            trust: whether code of the user's own may be imported. What was imported before needs no trust.
             strict: whether a file that has changed since is an error instead of a warning.
         Raises:
             UnknownName, ParameterError: it does not exist, or not with these parameters. UntrustedCode: see `trust`.

@@ -10,7 +10,7 @@ whose mean so far is worse than the median of earlier trials at the same point i
 runs of a trial that fit together are one program. The first trial is what the
 table says now, so that the best is never worse than that on the instances and seeds of the search.
 
-Source: Bergstra et al. (2011), Algorithms for hyper-parameter optimization; Akiba et al. (2019), Optuna.
+Source: Bergstra et al. (2011), Algorithms for hyper-parameter optimization, and Akiba et al. (2019), Optuna.
 """
 
 import contextlib
@@ -54,10 +54,10 @@ class TuningResult:
     """Best hyperparameters of a search, and its trials.
 
     Attributes:
-        agent, environment, observation: whose hyperparameters these are; `environment` is the name of the class.
+        agent, environment, observation: what the hyperparameters are for. `environment` is the name of the class.
         hyperparameters: the best that were found, all of them, those that were not searched included.
         score: mean normalised regret of the best trial.
-        first_score: the score of the first trial, what the table said before; None if it was not finished.
+        first_score: the score of the first trial, what the table said before. None if it was not finished.
         trials: a dictionary for each: number, hyperparameters, score, status ("finished", "given up"), seconds,
             reports (number of evaluations -> mean so far).
         folder: to which it was written, or None.
@@ -96,19 +96,19 @@ def tune(  # noqa: PLR0913
 
     Args:
         agent: as for `train`.
-        environments: instances, named or made; all of one class.
+        environments: instances, named or made, all of one class.
         steps, observation, sticky, random: of every run, as for `train`.
         trials: number of trials, those that `out` holds already included.
-        chances: several kinds of chance, such as [{}, {"random": 0.1}, {"reward_delay": 3}], each for every instance;
+        chances: several kinds of chance, such as [{}, {"random": 0.1}, {"reward_delay": 3}], each for every instance,
             in place of `sticky` and `random`.
-        seeds: of the runs of a trial; keep them apart from the seeds of the experiment that follows.
+        seeds: of the runs of a trial. Keep them apart from the seeds of the experiment that follows.
         space: what is searched: of each hyperparameter (of a function: a keyword) ("log", low, high), ("linear", low,
-            high) or ("one of", value, ...); None: the agent's own (`pharos.agents.Agent.space`).
+            high) or ("one of", value, ...). Default: the agent's own (`pharos.agents.Agent.space`).
         search_seed: of the search.
-        engine: "sb3": the runs of a trial one after the other; "batched": at once.
+        engine: "sb3" trains the runs of a trial one after the other, "batched" at once.
         shortlist, predicted: of so many proposals the one is tried whose hyperparameters this function gives the least
-            number, such as `pharos.prediction.regret_predictor`; the first trial is what the table says.
-        out: folder; a search there goes on. None: nothing is written.
+            number, such as `pharos.prediction.regret_predictor`. The first trial is what the table says.
+        out: folder. A search there goes on. None: nothing is written.
         progress: called after each trial with trials done, trials in all, and the best score so far.
     Raises:
         ParameterError: the environments are of several classes, the agent has no space, `out` holds another search, or
@@ -249,7 +249,7 @@ class _Search:
         return {key: suggested_value(trial, key, choices) for key, choices in self.space.items()}
 
     def score(self, trial: "optuna.Trial", pruned: type[Exception]) -> float:
-        """The mean normalised regret of evaluations after the first, over all runs; `pruned` is raised on the way."""
+        """The mean normalised regret of evaluations after the first, over all runs. `pruned` is raised on the way."""
         hyperparameters = {**self.table, **self.proposal(trial)}
         interval = max(1, self.steps // RUN_EVALUATIONS)
         configs: list[RunConfig] = []
@@ -283,7 +283,7 @@ class _Search:
 
 
 def _checked_space(agent: str, space: Mapping[str, Sequence[Any]] | None) -> dict[str, tuple[Any, ...]]:
-    """`space`, or the space of the agent; ParameterError if there is none, or an entry is wrong."""
+    """`space`, or the space of the agent. ParameterError if there is none, or an entry is wrong."""
     searched = space if space is not None else agent_called(agent).space
     if not searched:
         raise ParameterError(
@@ -318,7 +318,7 @@ def _allows(choices: tuple[Any, ...], value: object) -> bool:
 
 
 def _study(optuna: ModuleType, search: _Search, records: Sequence[Mapping[str, Any]]) -> "optuna.Study":
-    """Optuna's study with the trials that are over; its first trial has the hyperparameters of the table."""
+    """Optuna's study with the trials that are over. Its first trial has the hyperparameters of the table."""
     optuna.logging.set_verbosity(optuna.logging.ERROR)  # what fails is raised
     pruner = optuna.pruners.MedianPruner(n_startup_trials=5, n_warmup_steps=10)
     study = optuna.create_study(pruner=pruner, direction="minimize")
@@ -351,7 +351,7 @@ def _most_promising(
     trials: int,
     predicted: Callable[[Mapping[str, Any]], float],
 ) -> dict[str, Any]:
-    """The proposal for the next trial with the least predicted number of `search.shortlist`; the first of equals."""
+    """The proposal for the next trial with the least predicted number of `search.shortlist`, the first of equals."""
     scratch, proposals = _study(optuna, search, records), []
     for number in range(search.shortlist):
         scratch.sampler = _sampler(optuna, search, len(records), trials, number)
@@ -457,6 +457,6 @@ def _record(trial: "optuna.trial.FrozenTrial") -> dict[str, Any]:
 
 
 def _best(trials: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """The first of the best trials; a score of infinity if none is finished."""
+    """The first of the best trials, with a score of infinity if none is finished."""
     finished = [trial for trial in trials if trial["status"] == "finished"]
     return min(finished, key=lambda trial: trial["score"], default={"score": math.inf, "hyperparameters": {}})

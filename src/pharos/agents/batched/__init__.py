@@ -9,8 +9,8 @@ from pharos.system import lazy
 
 if TYPE_CHECKING:
     from pharos.agents.batched.batch import Batch, make_batch
-    from pharos.agents.batched.runs import OURS, BatchRun, ObservationSource, group_key, lane_width, supports
+    from pharos.agents.batched.runs import OWN_OPTIONS, BatchRun, ObservationSource, group_key, lane_width, supports
 
-__all__ = ["OURS", "Batch", "BatchRun", "ObservationSource", "group_key", "lane_width", "make_batch", "supports"]
+__all__ = ["OWN_OPTIONS", "Batch", "BatchRun", "ObservationSource", "group_key", "lane_width", "make_batch", "supports"]
 
 __getattr__ = lazy.attributes(__name__)

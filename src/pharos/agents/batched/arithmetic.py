@@ -1,8 +1,8 @@
-"""Arithmetic of W runs on a device: pinned buffers and recorded CUDA graphs; losses, their gradients and Adam.
+"""Arithmetic of W runs on a device: pinned buffers and recorded CUDA graphs, losses, their gradients and Adam.
 
 The arithmetic is there in two ways: compiled loops on the processor, tensor operations elsewhere. Both take and give
-tensors; the loops see them as arrays. What they compute is in kernels/batched.py.
-Tensor operations wait for nothing, so that a GPU can record them.
+tensors. The loops see them as arrays. What they compute is in kernels/batched.py. Tensor operations wait for nothing,
+so that a GPU can record them.
 """
 
 import warnings
@@ -18,7 +18,7 @@ from pharos.kernels import batched as kernels
 class PinnedBuffer:
     """A host array and its tensor on a device, with copies in both directions.
 
-    On the processor both are one. Otherwise the array lies in memory that a GPU can reach, so that neither waits;
+    On the processor both are one. Otherwise the array lies in memory that a GPU can reach, so that neither waits:
     whoever writes into it, or reads from it, waits for the device first (`wait`).
 
     Attributes:
@@ -45,7 +45,7 @@ class PinnedBuffer:
 class CudaGraph:
     """Operations on tensors with fixed addresses, recorded as a CUDA graph on a GPU and run as one launch.
 
-    The first call runs them one by one, which also takes all the room that they need; the second one records them.
+    The first call runs them one by one, which also takes all the room that they need. The second one records them.
     If that fails they are run one by one, with a warning, as recording changes no result.
     """
 
@@ -83,7 +83,7 @@ def is_gpu(device: str) -> bool:
 
 
 def wait(device: str) -> None:
-    """Synchronize with the device; returns at once on the processor."""
+    """Synchronize with the device. Returns at once on the processor."""
     if is_gpu(device):
         torch.cuda.current_stream().synchronize()
 
@@ -101,7 +101,7 @@ class CompiledArithmetic:
     def huber(
         self, q: Tensor, q_next: Tensor, q_choice: Tensor, minibatch: Sequence[Tensor], dq: Tensor, loss: PinnedBuffer
     ) -> None:
-        """Write the Huber loss of DQN (W,) and its gradient; minibatch: (actions, rewards, discounts) (W, B)."""
+        """Write the Huber loss of DQN (W,) and its gradient. minibatch: (actions, rewards, discounts) (W, B)."""
         q_arrays = q.numpy(), q_next.numpy(), q_choice.numpy()
         actions, rewards, discounts = (part.numpy() for part in minibatch)
         kernels.huber(*q_arrays, actions, rewards, discounts, dq.numpy(), loss.array)
@@ -110,7 +110,7 @@ class CompiledArithmetic:
         self, scores: Tensor, values: Tensor, minibatch: Sequence[Tensor], weights: Sequence[Tensor],
         gradients: Sequence[Tensor], loss: PinnedBuffer, divergence: PinnedBuffer,
     ) -> None:  # fmt: skip
-        """Write the clipped loss of PPO and its gradients; minibatch: (actions, old log p, advantages, returns) (W, B).
+        """Write the clipped loss of PPO and its gradients. minibatch: (actions, old log p, advantages, returns) (W, B).
 
         Args:
             weights: (clip range, of the entropy, of the value), (W,) float64 each.
@@ -125,7 +125,7 @@ class CompiledArithmetic:
     def plan(
         self, counts: np.ndarray, is_active: np.ndarray, rates: np.ndarray, max_norms: np.ndarray, eps: float
     ) -> None:
-        """Set learning rates and active runs (W,) of the next `adam`; it increments `counts` (W,) of active runs.
+        """Set learning rates and active runs (W,) of the next `adam`. It increments `counts` (W,) of active runs.
 
         Args:
             rates, max_norms: (W,).
@@ -133,7 +133,7 @@ class CompiledArithmetic:
         self._steps = counts, is_active, rates, max_norms, eps
 
     def adam(self, state: Sequence[Tensor]) -> None:
-        """Adam step set by `plan`; state: (parameters, gradients, means, squares), (W, P) each."""
+        """Adam step set by `plan`. state: (parameters, gradients, means, squares), (W, P) each."""
         assert self._steps is not None
         parameters, gradients, means, squares = (tensor.numpy() for tensor in state)
         kernels.adam(parameters, gradients, means, squares, *self._steps)
@@ -215,7 +215,7 @@ class TensorArithmetic(CompiledArithmetic):
 
 
 def fused_adam() -> Callable[[Sequence[Tensor], Tensor], None] | None:
-    """Adam in one pass over a GPU's memory, by Triton, which torch for CUDA brings along; None if it does not."""
+    """Adam in one pass over a GPU's memory, by Triton, which torch for CUDA brings along. None if it does not."""
     try:
         from pharos.agents.batched import fused
     except ImportError:

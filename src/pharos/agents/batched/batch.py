@@ -19,7 +19,7 @@ class Batch:
     Attributes:
         runs: as given.
         steps: of each run so far.
-        episodes: (N,) int64, finished ones; returns: (N,) float64, the sums of their returns.
+        episodes: (N,) int64, finished ones. returns: (N,) float64, the sums of their returns.
     """
 
     def __init__(self, agent: str, runs: Sequence[BatchRun], device: str = "cpu"):
@@ -55,8 +55,8 @@ class Batch:
     def learn(self, points: Sequence[int], at_point: Callable[[int], object]) -> None:
         """Train from `steps` on, and call `at_point` at each of the points.
 
-        As in Stable-Baselines3's callbacks that is before the update that is due then; at the last step of the
-        training it is after it.
+        As in Stable-Baselines3's callbacks that is before the update that is due then. At the last step of the training
+        it is after it.
         """
         for point in points:
             torch.set_flush_denormal(True)  # moments below 1e-38 would make Adam three times as slow
@@ -74,7 +74,7 @@ class Batch:
         )
 
     def greedy_actions(self, indices: Sequence[int]) -> None:
-        """None: these policies are no tables of states; they are queried about observations."""
+        """None: these policies are no tables of states. They are queried about observations."""
 
     def policy(self, i: int) -> RunPolicy:
         """The current policy of run i: greedy for DQN, probabilities for PPO."""
@@ -85,11 +85,11 @@ class Batch:
         return self.lanes[i // self.width].stored(i % self.width)
 
     def set_parameters(self, i: int, parameters: Mapping[str, np.ndarray]) -> None:
-        """Replace the network of run i by what `parameters` returned; on the processor alone."""
+        """Replace the network of run i by what `parameters` returned, on the processor alone."""
         self.lanes[i // self.width].restore_network(i % self.width, parameters)
 
     def state(self) -> dict[str, np.ndarray]:
-        """State of the batch for `restore`, which goes on bit for bit; the arrays are copies."""
+        """State of the batch for `restore`, which goes on bit for bit. The arrays are copies."""
         return joined_states({name: array.copy() for name, array in lane.arrays().items()} for lane in self.lanes)
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
@@ -102,8 +102,8 @@ def make_batch(agent: str, runs: Sequence[BatchRun], *, device: str = "cpu", thr
     """A batch of runs of one group.
 
     Args:
-        device: of torch, for the networks; episodes and replay memories stay on the processor.
-        threads: of torch; None for one, as studies use processes.
+        device: of torch, for the networks. Episodes and replay memories stay on the processor.
+        threads: of torch. Default: one, as studies use processes.
     Raises:
         ParameterError: the engine lacks a hyperparameter, or the runs are of several groups.
     """

@@ -1,4 +1,5 @@
-"""DQN of W runs at once (Mnih et al., 2015), as Stable-Baselines3 has it; `double` as van Hasselt et al. (2016).
+"""DQN of W runs at once (Mnih et al., 2015), as Stable-Baselines3 has it, with `double` as in van Hasselt et al.
+(2016).
 
 Its replay memory has numbers of states instead of what they look like, 14 bytes a transition. If several frames are
 seen a transition is no larger: the states before are in the rows before.
@@ -17,13 +18,13 @@ from pharos.kernels import batched as kernels
 
 
 class Replay:
-    """The last transitions of W runs with E copies each; a row is one step of all copies.
+    """The last transitions of W runs with E copies each. A row is one step of all copies.
 
     As in Stable-Baselines3 minibatches are drawn from the last max(buffer_size // E, 1) rows. If k frames are seen,
     k - 1 rows before them are kept as well.
 
     Attributes:
-        size: of how many rows minibatches are drawn; rows: how many there are, of which the oldest is overwritten.
+        size: of how many rows minibatches are drawn. rows: how many there are, of which the oldest is overwritten.
         states, next_states (W, B) int64, or (W, B, k) if k frames are seen, actions (W, B) int64, rewards, discounts
             (W, B) float32: the minibatch that was drawn.
     """
@@ -69,7 +70,7 @@ class Replay:
             array[:, row] = new
 
     def sample(self, calls: int, draw: int, gammas: np.ndarray, num_steps: int) -> None:
-        """Draw a minibatch for each run that is not idle, after `calls` steps; see `kernels.sample`."""
+        """Draw a minibatch for each run that is not idle, after `calls` steps, see `kernels.sample`."""
         batch = tuple(part.array[: self.number] for part in self.drawn)
         filled = min(calls, self.size)
         keys, draws = self.keys[: self.number], kernels.sample if self.frames == 1 else kernels.sample_histories
@@ -90,7 +91,7 @@ class DQNLane(Lane[QNetworks]):
 
     Attributes:
         target: (W, P) parameters of the target networks.
-        epsilon: (W,) the share of random actions; 0 before the first step, which knows no schedule yet.
+        epsilon: (W,) the share of random actions. 0 before the first step, which knows no schedule yet.
     """
 
     agent = "dqn"
@@ -148,7 +149,7 @@ class DQNLane(Lane[QNetworks]):
         return (self.steps > self.own["learning_starts"]) & ~self.is_idle
 
     def _follow_schedules(self) -> None:
-        """Copy to target networks that are due and anneal the exploration rates; called after each step."""
+        """Copy to target networks that are due and anneal the exploration rates. Called after each step."""
         copied = np.flatnonzero(self.calls % self._target_calls == 0)
         if len(copied):
             self.copy_to_targets(copied)
@@ -179,7 +180,7 @@ class DQNLane(Lane[QNetworks]):
         self._recorded_step()
 
     def gradient_step(self) -> None:
-        """Forward pass, loss, backward pass and Adam on the drawn minibatch; a GPU records this."""
+        """Forward pass, loss, backward pass and Adam on the drawn minibatch. A GPU records this."""
         batch = self.replay
         for part in batch.drawn:
             part.send()
@@ -202,7 +203,7 @@ class DQNLane(Lane[QNetworks]):
         return self._target_table[self._rows, states.tensor]
 
     def _all_target_scores(self, size: int) -> torch.Tensor:
-        """(W, S, A) of all states, `size` of each run at a time; runs with fewer states repeat their last one."""
+        """(W, S, A) of all states, `size` of each run at a time. Runs with fewer states repeat their last one."""
         numbers = np.array([run.mdp.num_states for run in self.runs])
         scores = torch.empty((self.width, int(numbers.max()), self.num_actions), device=self.device)
         states = PinnedBuffer((self.width, size), torch.int64, self.device)

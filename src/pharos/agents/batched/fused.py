@@ -11,7 +11,7 @@ PROGRAM_PARAMETERS = 1024  # parameters of a program
 
 @triton.jit
 def step_of_adam(parameters, gradients, means, squares, plans, length, size: tl.constexpr):  # type: ignore[no-untyped-def]
-    """A block of one run's parameters; plans: (scale, first, second, step, eps) of each run."""
+    """A block of one run's parameters. plans: (scale, first, second, step, eps) of each run."""
     run = tl.program_id(0).to(tl.int64)
     step = tl.load(plans + run * 5 + 3)
     if step != 0.0:
@@ -32,6 +32,6 @@ def step_of_adam(parameters, gradients, means, squares, plans, length, size: tl.
 
 
 def adam_on_gpu(state: Sequence[Tensor], plans: Tensor) -> None:
-    """A step for each run whose step is not 0; state: (parameters, gradients, means, squares) (W, P), plans (W, 5)."""
+    """A step for each run whose step is not 0. state: (parameters, gradients, means, squares) (W, P), plans (W, 5)."""
     width, length = state[0].shape
     step_of_adam[(width, triton.cdiv(length, PROGRAM_PARAMETERS))](*state, plans, length, PROGRAM_PARAMETERS)

@@ -20,10 +20,10 @@ from pharos.kernels import patches
 from pharos.kernels.batched import linear_row
 
 ALIGNED_FLOATS = 16  # floats: each parameter of each run begins at a multiple of 64 bytes
-RELU, TANH, NONE = "relu", "tanh", "none"
+RELU_ACTIVATION, TANH_ACTIVATION, NO_ACTIVATION = "relu", "tanh", "none"
 ALL_PARAMETERS = "all parameters"
 PIXEL_MASK = "which pixels there are"
-KERNEL, FILTERS = 3, patches.FILTERS  # of the small convolution
+KERNEL = 3  # of the small convolution
 FEATURES = 128
 
 Values = dict[str, Tensor]
@@ -82,7 +82,7 @@ class Parameters:
         self.length += -(-self.shapes[-1].size // ALIGNED_FLOATS) * ALIGNED_FLOATS
 
     def views(self, rows: Tensor) -> Values:
-        """name -> (W, ...) view of (W, P); all of it under the name ALL_PARAMETERS."""
+        """name -> (W, ...) view of (W, P), all of it under the name ALL_PARAMETERS."""
         views = {
             each.name: rows[:, each.offset : each.offset + each.size].view(len(rows), *each.shape)
             for each in self.shapes
@@ -91,7 +91,7 @@ class Parameters:
 
 
 def aligned_zeros(width: int, *shape: int, device: str | torch.device | None = None) -> Tensor:
-    """(W, ...) float32 zeros; each run begins at a multiple of 64 bytes, so that its position changes no result."""
+    """(W, ...) float32 zeros. Each run begins at a multiple of 64 bytes, so that its position changes no result."""
     size = math.prod(shape)
     rows = torch.zeros((width, -(-size // ALIGNED_FLOATS) * ALIGNED_FLOATS), device=device)
     return rows[:, :size].view(width, *shape)
@@ -103,7 +103,7 @@ def flat_view(y: Tensor) -> Tensor:
 
 
 class NetworkLayer:
-    """x (W, B, in) -> (W, B, out); keeps its buffers for each number of rows, overwritten by the next call."""
+    """x (W, B, in) -> (W, B, out). Keeps its buffers for each number of rows, overwritten by the next call."""
 
     def __init__(self, name: str, inputs: int, outputs: int, activation: str):
         self.name, self.inputs, self.outputs, self.activation = name, inputs, outputs, activation
@@ -114,7 +114,7 @@ class NetworkLayer:
         raise NotImplementedError
 
     def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> Tensor | None:
-        """Write the gradients of the parameters, after `forward` of x; return the gradient of x if `onward`."""
+        """Write the gradients of the parameters, after `forward` of x. Return the gradient of x if `onward`."""
         raise NotImplementedError
 
     def _buffers(self, x: Tensor, *, onward: bool = False) -> tuple[Tensor, Tensor]:
@@ -129,16 +129,16 @@ class NetworkLayer:
         return y, dx
 
     def _activate(self, y: Tensor) -> None:
-        if self.activation == RELU:
+        if self.activation == RELU_ACTIVATION:
             y.clamp_(min=0.0)
-        elif self.activation == TANH:
+        elif self.activation == TANH_ACTIVATION:
             flat_view(y).tanh_()
 
     def _before_activation(self, dy: Tensor, y: Tensor) -> Tensor:
         """Gradient before the activation, written over dy."""
-        if self.activation == RELU:
+        if self.activation == RELU_ACTIVATION:
             return torch.ops.aten.threshold_backward.grad_input(dy, y, 0, grad_input=dy)
-        if self.activation == TANH:
+        if self.activation == TANH_ACTIVATION:
             return torch.ops.aten.tanh_backward.grad_input(dy, y, grad_input=dy)
         return dy
 
@@ -147,8 +147,8 @@ class LinearLayer(NetworkLayer):
     """y = activation(x w + b).
 
     Args:
-        pixels: if the inputs are `pixels` cells of a picture with all channels each; Stable-Baselines3 has the
-            channels outside.
+        pixels: if the inputs are `pixels` cells of a picture with all channels each. Stable-Baselines3 has the channels
+            outside.
     """
 
     def __init__(
@@ -170,11 +170,11 @@ class LinearLayer(NetworkLayer):
     def forward(self, values: Values, x: Tensor) -> Tensor:
         """The outputs."""
         y, _ = self._buffers(x)
-        if x.shape[1] == 1 and x.device.type == "cpu" and self.activation != TANH:
+        if x.shape[1] == 1 and x.device.type == "cpu" and self.activation != TANH_ACTIVATION:
             # to act once is to read all weights; weights of inputs that a ReLU made 0 need not be
             rows = values[ALL_PARAMETERS].numpy()
             weight, bias = self._offsets
-            linear_row(rows, weight, bias, x[:, 0].numpy(), self.activation == RELU, y[:, 0].numpy())
+            linear_row(rows, weight, bias, x[:, 0].numpy(), self.activation == RELU_ACTIVATION, y[:, 0].numpy())
             return y
         torch.baddbmm(values[f"{self.name}.bias"], x, values[f"{self.name}.weight"], out=y)
         self._activate(y)
@@ -192,7 +192,7 @@ class LinearLayer(NetworkLayer):
 class PatchConvolutionLayer(NetworkLayer):
     """A convolution of 3 x 3 with padding as one product: x holds the 9 C neighbours of each pixel, from 0 to 255.
 
-    They come out of a table, so that nothing is unfolded here; 1 / 255 is a factor of the weights. y is (W, B, pixels
+    They come out of a table, so that nothing is unfolded here. 1 / 255 is a factor of the weights. y is (W, B, pixels
     x filters). Runs whose pictures are smaller than the pictures of others in their lane have a mask (W, pixels) among
     the values, which keeps what is no pixel of theirs at 0.
     """
@@ -200,7 +200,7 @@ class PatchConvolutionLayer(NetworkLayer):
     def __init__(self, parameters: Parameters, name: str, shape: tuple[int, ...], filters: int):
         channels, height, width = shape
         self.pixels, self.neighbours, self.filters = height * width, channels * KERNEL**2, filters
-        super().__init__(name, self.pixels * self.neighbours, self.pixels * filters, RELU)
+        super().__init__(name, self.pixels * self.neighbours, self.pixels * filters, RELU_ACTIVATION)
         outside = (filters, channels, KERNEL, KERNEL)
         parameters.add(
             f"{name}.weight",
@@ -222,7 +222,7 @@ class PatchConvolutionLayer(NetworkLayer):
         return y
 
     def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> None:
-        """See `NetworkLayer`; there is no gradient of the input."""
+        """See `NetworkLayer`. There is no gradient of the input."""
         y, _ = self._buffers(x)
         rows = self._rows(self._before_activation(dy, y))
         torch.sum(rows, 1, keepdim=True, out=gradients[f"{self.name}.bias"])
@@ -234,10 +234,10 @@ class PatchConvolutionLayer(NetworkLayer):
 
 
 class ConvolutionLayer(NetworkLayer):
-    """A strided convolution without padding; on the processor run by run, else as one grouped one.
+    """A strided convolution without padding, on the processor run by run, else as one grouped one.
 
     Args:
-        shape: (C, H, W) of its inputs; scale: a factor of them.
+        shape: (C, H, W) of its inputs. scale: a factor of them.
     Attributes:
         shape_out: (filters, H, W).
     """
@@ -249,7 +249,7 @@ class ConvolutionLayer(NetworkLayer):
         channels, height, width = shape
         self.shape_in, self.stride, self.scale = shape, stride, scale
         self.shape_out = (filters, (height - kernel) // stride + 1, (width - kernel) // stride + 1)
-        super().__init__(name, math.prod(shape), math.prod(self.shape_out), RELU)
+        super().__init__(name, math.prod(shape), math.prod(self.shape_out), RELU_ACTIVATION)
         fan_in = channels * kernel**2
 
         def same(w: np.ndarray) -> np.ndarray:
@@ -315,12 +315,12 @@ class ConvolutionLayer(NetworkLayer):
 class PictureLayers(NetworkLayer):
     """The small convolution and the linear layer after it, on the processor: each different patch once.
 
-    x (W, B, C pixels), from 0 to 255. The parameters belong to the two layers; see kernels/patches.py.
+    x (W, B, C pixels), from 0 to 255. The parameters belong to the two layers, see kernels/patches.py.
     """
 
     def __init__(self, parameters: Parameters, name: str, shape: tuple[int, ...]):
         self.shape, self.indices = shape, input_indices(shape, True).reshape(math.prod(shape[1:]), -1)
-        super().__init__(name, math.prod(shape), FEATURES, RELU)
+        super().__init__(name, math.prod(shape), FEATURES, RELU_ACTIVATION)
         picture_layers(parameters, name, shape)
         self._offsets = tuple(each.offset for each in parameters.shapes[-4:])
         self._memories: dict[tuple[int, int], tuple[np.ndarray, ...]] = {}
@@ -334,7 +334,7 @@ class PictureLayers(NetworkLayer):
             self._memories[width, number] = (
                 np.zeros((width, pixels + 1), np.int64),
                 *(np.empty(groups, np.int32) for _ in range(2)),
-                np.empty((*groups, FILTERS), np.float32),
+                np.empty((*groups, patches.FILTERS), np.float32),
                 np.empty((width, pixels, number), np.int32),
             )
         memory, pictures = self._memories[width, number], flat_view(x).numpy()
@@ -344,7 +344,7 @@ class PictureLayers(NetworkLayer):
         return y
 
     def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> None:
-        """See `NetworkLayer`; there is no gradient of the input."""
+        """See `NetworkLayer`. There is no gradient of the input."""
         dy = self._before_activation(dy, self._buffers(x)[0])
         rows, written = values[ALL_PARAMETERS].numpy(), gradients[ALL_PARAMETERS].numpy()
         memory, pictures = self._memories[x.shape[0], x.shape[1]], flat_view(x).numpy()
@@ -383,7 +383,7 @@ class Stack:
         return x
 
     def backward(self, values: Values, gradients: Values, dy: Tensor, *, onward: bool = False) -> Tensor:
-        """Write the gradients of all parameters, after `forward`; return the gradient of the input if `onward`."""
+        """Write the gradients of all parameters, after `forward`. Return the gradient of the input if `onward`."""
         for i in range(len(self.layers) - 1, -1, -1):
             dx = self.layers[i].backward(values, gradients, self._inputs[i], dy, onward=onward or i > 0)
             dy = dy if dx is None else dx
@@ -395,8 +395,11 @@ class Stack:
 
 def picture_layers(parameters: Parameters, name: str, shape: tuple[int, ...]) -> list[NetworkLayer]:
     """The small convolution and the linear layer after it, for observations with the neighbours of each pixel."""
-    small = PatchConvolutionLayer(parameters, f"{name}.layers.0.0", shape, FILTERS)
-    return [small, LinearLayer(parameters, f"{name}.layers.1", small.outputs, FEATURES, RELU, pixels=small.pixels)]
+    small = PatchConvolutionLayer(parameters, f"{name}.layers.0.0", shape, patches.FILTERS)
+    return [
+        small,
+        LinearLayer(parameters, f"{name}.layers.1", small.outputs, FEATURES, RELU_ACTIVATION, pixels=small.pixels),
+    ]
 
 
 def extractor_layers(
@@ -404,7 +407,7 @@ def extractor_layers(
 ) -> list[NetworkLayer]:
     """The layers from an observation to 128 features: SmallMLP, or SmallCNN with one or three convolutions."""
     if not is_image:
-        return [LinearLayer(parameters, f"{name}.layers.1", math.prod(shape), FEATURES, RELU)]
+        return [LinearLayer(parameters, f"{name}.layers.1", math.prod(shape), FEATURES, RELU_ACTIVATION)]
     if is_small(shape, is_image):
         return [PictureLayers(parameters, name, shape)] if device == "cpu" else picture_layers(parameters, name, shape)
     convolutions: list[NetworkLayer] = []
@@ -413,7 +416,7 @@ def extractor_layers(
         layer = ConvolutionLayer(parameters, f"{name}.layers.0.{2 * i}", shape, filters, kernel, stride, scale)
         convolutions.append(layer)
         shape = layer.shape_out
-    return [*convolutions, LinearLayer(parameters, f"{name}.layers.1", math.prod(shape), FEATURES, RELU)]
+    return [*convolutions, LinearLayer(parameters, f"{name}.layers.1", math.prod(shape), FEATURES, RELU_ACTIVATION)]
 
 
 def pad(own: Parameters, rows: np.ndarray, common: Parameters) -> np.ndarray:
@@ -444,7 +447,7 @@ def sizes_of(net_arch: NetArch, head: str = "pi") -> list[int]:
 
 
 def parameter_names(name: str) -> list[str]:
-    """All names of a parameter in Stable-Baselines3; parameters of shared parts have several."""
+    """All names of a parameter in Stable-Baselines3. Parameters of shared parts have several."""
     extractors = [name]
     if name.startswith("features_extractor."):
         extractors += [f"{part}_{name}" for part in ("pi", "vf")]
@@ -452,7 +455,7 @@ def parameter_names(name: str) -> list[str]:
 
 
 class BatchedNetwork(Protocol):
-    """W networks of one shape; interface to a lane.
+    """W networks of one shape, the interface to a lane.
 
     Attributes:
         parameters: their positions. eps: of Adam.
@@ -481,8 +484,10 @@ class QNetworks:
         self.parameters = parameters = Parameters()
         sizes = sizes_of(net_arch)
         layers = extractor_layers(parameters, "q_net.features_extractor", shape, is_image, device)
-        layers += hidden(parameters, "q_net.q_net", sizes, RELU)
-        last = LinearLayer(parameters, f"q_net.q_net.{2 * len(sizes)}", [FEATURES, *sizes][-1], num_actions, NONE)
+        layers += hidden(parameters, "q_net.q_net", sizes, RELU_ACTIVATION)
+        last = LinearLayer(
+            parameters, f"q_net.q_net.{2 * len(sizes)}", [FEATURES, *sizes][-1], num_actions, NO_ACTIVATION
+        )
         self.stack = Stack([*layers, last])
 
     def scores(self, values: Values, x: Tensor) -> Tensor:
@@ -490,7 +495,7 @@ class QNetworks:
         return self.stack.forward(values, x)
 
     def backward(self, values: Values, gradients: Values, dq: Tensor) -> None:
-        """Write the gradients; called after `scores`."""
+        """Write the gradients. Called after `scores`."""
         self.stack.backward(values, gradients, dq)
 
     def initial(self, draws: Draws) -> np.ndarray:
@@ -513,10 +518,10 @@ class ActorCritics:
         self.parameters = parameters = Parameters()
         self.trunk = Stack(extractor_layers(parameters, "features_extractor", shape, is_image, device))
         actor, critic = sizes_of(net_arch, "pi"), sizes_of(net_arch, "vf")
-        actor_layers = hidden(parameters, "mlp_extractor.policy_net", actor, TANH)
-        critic_layers = hidden(parameters, "mlp_extractor.value_net", critic, TANH)
-        actor_layers.append(LinearLayer(parameters, "action_net", [FEATURES, *actor][-1], num_actions, NONE))
-        critic_layers.append(LinearLayer(parameters, "value_net", [FEATURES, *critic][-1], 1, NONE))
+        actor_layers = hidden(parameters, "mlp_extractor.policy_net", actor, TANH_ACTIVATION)
+        critic_layers = hidden(parameters, "mlp_extractor.value_net", critic, TANH_ACTIVATION)
+        actor_layers.append(LinearLayer(parameters, "action_net", [FEATURES, *actor][-1], num_actions, NO_ACTIVATION))
+        critic_layers.append(LinearLayer(parameters, "value_net", [FEATURES, *critic][-1], 1, NO_ACTIVATION))
         self.actor, self.critic = Stack(actor_layers), Stack(critic_layers)
 
     def both(self, values: Values, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -533,13 +538,13 @@ class ActorCritics:
         return self.critic.forward(values, self.trunk.forward(values, x))
 
     def backward(self, values: Values, gradients: Values, dscores: Tensor, dvalues: Tensor) -> None:
-        """Write the gradients; called after `both`."""
+        """Write the gradients. Called after `both`."""
         features = self.actor.backward(values, gradients, dscores, onward=True)
         features.add_(self.critic.backward(values, gradients, dvalues, onward=True))
         self.trunk.backward(values, gradients, features)
 
     def initial(self, draws: Draws) -> np.ndarray:
-        """(W, P): orthogonal weights times sqrt(2), 0.01 for the actions and 1 for the value; biases 0.
+        """(W, P): orthogonal weights times sqrt(2), 0.01 for the actions and 1 for the value. Biases are 0.
 
         Source: Saxe et al. (2014), as torch draws it: the Q of a normal matrix, its columns signed by R's diagonal.
         """

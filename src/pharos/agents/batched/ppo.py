@@ -19,7 +19,7 @@ class PPOLane(Lane[ActorCritics]):
 
     Attributes:
         states, next_states (W, T, E, *depth), actions_taken (W, T, E) int64, log_probabilities, kept_values, rewards,
-            begins, advantages (W, T, E) float32: the rollout that goes on; begins is 1 if a step is the first of its
+            begins, advantages (W, T, E) float32: the rollout that goes on. begins is 1 if a step is the first of its
             episode.
         timeouts: (W, T, E) bool, whether a step was cut off by the time limit.
         begin: (W, E) float32, whether the next step is the first of its episode.
@@ -54,7 +54,7 @@ class PPOLane(Lane[ActorCritics]):
         return ActorCritics(shape, self.seen.is_image, self.shared["net_arch"], self.num_actions, self.device)
 
     def evaluate(self, x: torch.Tensor) -> torch.Tensor:
-        """See `Lane`; writes the values of the states, too."""
+        """See `Lane`. Writes the values of the states, too."""
         scores, values = self.network.both(self.values, x)
         self._valued.tensor.copy_(values)
         self._valued.fetch()
@@ -128,7 +128,8 @@ class PPOLane(Lane[ActorCritics]):
         return self._valued.array[..., 0].copy()
 
     def learn_minibatch(self, minibatch: tuple[np.ndarray, ...], is_active: np.ndarray) -> np.ndarray:
-        """One gradient step of the active runs whose policy has not moved too far (`target_kl`); (W,) bool: these runs.
+        """One gradient step of the active runs whose policy has not moved too far (`target_kl`). Return (W,) bool:
+        these runs.
 
         Args:
             minibatch: (states, actions, logarithms of probabilities, advantages, returns), (W, B) each, states
@@ -158,7 +159,7 @@ class PPOLane(Lane[ActorCritics]):
 
 
 class MinibatchUpdate:
-    """Update of PPO on minibatches of one size; a GPU records both parts.
+    """Update of PPO on minibatches of one size. A GPU records both parts.
 
     `forward`: scores, values, loss and its gradients. `optimizer_step`: backward pass and Adam.
 

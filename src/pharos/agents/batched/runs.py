@@ -1,4 +1,4 @@
-"""Specification of one run: MDP, observations, hyperparameters; and which runs can share a batch."""
+"""Specification of one run: MDP, observations, hyperparameters, and which runs can share a batch."""
 
 import math
 from collections.abc import Hashable, Mapping
@@ -63,7 +63,7 @@ OF_A_BATCH: dict[str, dict[str, Any]] = {
         "net_arch": [128],
     },
 }
-OURS = ("double",)
+OWN_OPTIONS = ("double",)
 """Hyperparameters that Stable-Baselines3 does not have."""
 # Names that change nothing here, or that may have this one value only.
 WITHOUT_EFFECT = ("n_timesteps", "verbose", "stats_window_size")
@@ -78,7 +78,7 @@ ONLY: dict[str, Any] = {
     "sde_sample_freq": -1,
     "clip_range_vf": None,
 }
-NATURE = 36  # pixels from which the three convolutions of Mnih et al. (2015) take the place of one, as in sb3.py
+NATURE_PIXELS = 36  # pixels from which the three convolutions of Mnih et al. (2015) take the place of one, as in sb3.py
 MOST_REMEMBERED = 1 << 14  # states whose target values are kept
 OBSERVED_AT_ONCE = 4096  # states that are observed at once
 
@@ -124,7 +124,7 @@ class ObservationSource:
         return ObservationSource(space, observe)
 
     def at(self, indices: np.ndarray) -> np.ndarray:
-        """(N, ...): the observations of states (N,); of histories (N, k), the oldest first, if k frames are seen."""
+        """(N, ...): the observations of states (N,), or of histories (N, k), the oldest first, if k frames are seen."""
         states = self.space.states(indices.ravel())
         if self.frames == 1:
             return np.asarray(self.observe(states))
@@ -140,19 +140,19 @@ class BatchRun:
     """Specification of one run.
 
     Attributes:
-        mdp: with its chance, apart from lazy actions; runs of one task share the same.
-        observe: what the agent sees of the states; runs of one task share the same.
+        mdp: with its chance, apart from lazy actions. Runs of one task share the same.
+        observe: what the agent sees of the states. Runs of one task share the same.
         time_limit: steps of an episode.
         hyperparameters: under the names of Stable-Baselines3.
         steps: of the whole training, for the schedules.
         seed: for the record.
-        key: 64 bits that name the run; all its random numbers follow from them.
+        key: 64 bits that name the run. All its random numbers follow from them.
         gamma: of the returns that are counted, not the agent's own discount.
-        outcome_rewards: (N,) what each possible outcome pays, as `rewards_of_outcomes` gives it; None: expected rewards
+        outcome_rewards: (N,) what each possible outcome pays, as `rewards_of_outcomes` gives it. None: expected rewards
             are paid.
-        chance: of it laziness, and noise and delay in what is paid; the rest is in `mdp`. Returns are of what is
+        chance: of it laziness, and noise and delay in what is paid. The rest is in `mdp`. Returns are of what is
             earned.
-        staying: (S, A) what an action without effect pays; needed if actions are lazy.
+        staying: (S, A) what an action without effect pays. Needed if actions are lazy.
     """
 
     mdp: TabularMDP
@@ -176,7 +176,7 @@ class BatchRun:
 
 
 def supports(agent: str, hyperparameters: Mapping[str, Any]) -> str | None:
-    """None if the engine has the agent and its hyperparameters; else the first that it lacks, and why."""
+    """None if the engine has the agent and its hyperparameters, else the first that it lacks, and why."""
     if agent not in OF_A_RUN:
         return f"agent {agent!r}: the batched engine has {' and '.join(OF_A_RUN)}"
     for name, value in hyperparameters.items():
@@ -201,7 +201,7 @@ def supports(agent: str, hyperparameters: Mapping[str, Any]) -> str | None:
 
 
 def resolved(agent: str, hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
-    """All hyperparameters of an agent; ParameterError if the engine lacks one."""
+    """All hyperparameters of an agent. ParameterError if the engine lacks one."""
     lacking = supports(agent, hyperparameters)
     if lacking is not None:
         raise ParameterError(f"{lacking}; the engine sb3 has it")
@@ -214,7 +214,7 @@ def resolved(agent: str, hyperparameters: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def group_key(agent: str, run: SizedRun, device: str = "cpu") -> Hashable:
-    """Key of a run; runs with equal keys can share a batch.
+    """Key of a run. Runs with equal keys can share a batch.
 
     On the processor they see observations of one shape. On other devices a wide lane costs hardly more than a
     narrow one: vectors share a batch with others of about their length, and small images with images of as many
@@ -240,7 +240,7 @@ def _scale(number: int) -> int:
 
 def is_small(shape: tuple[int, ...], is_image: bool) -> bool:
     """Whether an observation is an image of the small convolution, which sees the neighbours of each pixel."""
-    return is_image and min(shape[1:]) < NATURE
+    return is_image and min(shape[1:]) < NATURE_PIXELS
 
 
 def as_networks_see(shape: tuple[int, ...], is_image: bool) -> tuple[tuple[int, ...], bool]:

@@ -20,17 +20,18 @@ from pharos.errors import ParameterError
 
 FLOOR, WALL, GOAL, LAVA = "..", "##", "GG", "~~"
 PLAYER = (">>", "vv", "<<", "^^")
-COLORS = "BGEPRY"  # blue, green, grey, purple, red, yellow: the order in which minigrid draws them
+COLOR_LETTERS = "BGEPRY"  # blue, green, grey, purple, red, yellow: the order in which minigrid draws them
 RIGHT, DOWN, LEFT, UP = range(4)
 AHEAD = ((1, 0), (0, 1), (-1, 0), (0, -1))
-ATTEMPTS = 1000  # at a free cell of a room; minigrid gives up after as many
+FREE_CELL_ATTEMPTS = 1000  # at a free cell of a room; minigrid gives up after as many
 CONNECTIONS = 5000  # likewise, at doors that connect all rooms
 
 Place = tuple[int, int]
 
 
 class GridLayout(NamedTuple):
-    """A grid, row by row, and the target: a thing to pick up or a door to open, such as "BR"; None: only goals."""
+    """A grid, row by row, and the target: a thing to pick up or a door to open, such as "BR", or None for goals
+    only."""
 
     rows: tuple[str, ...]
     target: str | None = None
@@ -52,7 +53,7 @@ class Canvas:
 
     def color(self) -> str:
         """Random one of the six colours."""
-        return COLORS[self.integer(0, len(COLORS))]
+        return COLOR_LETTERS[self.integer(0, len(COLOR_LETTERS))]
 
     def walls_around(self, left: int, top: int, width: int, height: int) -> None:
         """Draw walls along the outline of a rectangle."""
@@ -61,7 +62,7 @@ class Canvas:
         self.cells[[left, right], top : bottom + 1] = WALL
 
     def free_cell(self, corner: Place, size: Place, *, away: bool = False, attempts: float = math.inf) -> Place:
-        """Random cell of floor in a rectangle without the player; with `away`, not beside the player either."""
+        """Random cell of floor in a rectangle without the player. With `away`, not beside the player either."""
         left, top = corner
         right, bottom = min(left + size[0], self.width), min(top + size[1], self.height)
         tried = 0
@@ -71,7 +72,9 @@ class Canvas:
             distance = abs(column - self.player[0]) + abs(row - self.player[1])
             if self.cells[column, row] == FLOOR and distance >= (2 if away else 1):
                 return column, row
-        raise ParameterError(f"MiniGrid: this seed finds no free cell in {ATTEMPTS} attempts; choose another seed")
+        raise ParameterError(
+            f"MiniGrid: this seed finds no free cell in {FREE_CELL_ATTEMPTS} attempts; choose another seed"
+        )
 
     def put_player(self, corner: Place = (0, 0), size: Place | None = None, attempts: float = math.inf) -> None:
         """Put the player onto a random free cell, with a random direction."""
@@ -86,7 +89,7 @@ class Canvas:
 
 
 class Rooms(Canvas):
-    """Rooms of `size` x `size` cells, walls included and shared; places for doors are drawn, but no doors yet."""
+    """Rooms of `size` x `size` cells, walls included and shared. Places for doors are drawn, but no doors yet."""
 
     def __init__(self, columns: int, rows: int, size: int, seed: int | None):
         pitch = size - 1
@@ -119,7 +122,7 @@ class Rooms(Canvas):
         return column + AHEAD[side][0], row + AHEAD[side][1], (side + 2) % 4
 
     def add_door(self, column: int, row: int, side: int, *, locked: bool = False) -> str:
-        """Add a door of a random colour; return the colour."""
+        """Add a door of a random colour, and return the colour."""
         color = self.color()
         self.cells[self.doorways[column, row, side]] = ("L" if locked else "D") + color
         self.doors |= {(column, row, side), self.across(column, row, side)}
@@ -128,10 +131,11 @@ class Rooms(Canvas):
         return color
 
     def add_thing(self, column: int, row: int, letter: str, color: str | None = None) -> str:
-        """Put a key K, ball A or box B on a random cell of a room; return it with its colour, drawn unless given."""
+        """Put a key K, ball A or box B on a random cell of a room. Return it with its colour, drawn if none is
+        passed."""
         thing = letter + (color or self.color())
         size = (self.size, self.size)
-        self.cells[self.free_cell(self.corner(column, row), size, away=True, attempts=ATTEMPTS)] = thing
+        self.cells[self.free_cell(self.corner(column, row), size, away=True, attempts=FREE_CELL_ATTEMPTS)] = thing
         return thing
 
     def remove_wall(self, column: int, row: int, side: int) -> None:
@@ -143,13 +147,13 @@ class Rooms(Canvas):
     def put_player_into(self, column: int, row: int) -> None:
         """Put the player into a room, with floor or a wall in front."""
         while True:
-            self.put_player(self.corner(column, row), (self.size, self.size), attempts=ATTEMPTS)
+            self.put_player(self.corner(column, row), (self.size, self.size), attempts=FREE_CELL_ATTEMPTS)
             ahead = AHEAD[self.direction]
             if self.cells[self.player[0] + ahead[0], self.player[1] + ahead[1]] in (FLOOR, WALL):
                 return
 
     def connect(self) -> None:
-        """Add doors between rooms until every room is reachable; locked rooms get no further doors."""
+        """Add doors between rooms until every room is reachable. Locked rooms get no further doors."""
         start = (self.player[0] // (self.size - 1), self.player[1] // (self.size - 1))
         for _ in range(CONNECTIONS + 1):
             if len(self._reachable(start)) == self.rows * self.columns:
@@ -336,7 +340,7 @@ def multi_room(size: int, rooms: int, seed: int) -> GridLayout:
     for number, room in enumerate(chain):
         canvas.walls_around(*room[:4])
         if number > 0:
-            colors = COLORS.replace(before, "") if before else COLORS
+            colors = COLOR_LETTERS.replace(before, "") if before else COLOR_LETTERS
             before = colors[canvas.integer(0, len(colors))]
             canvas.cells[room.entry] = "D" + before
     canvas.put_player(chain[0][:2], chain[0][2:4])
@@ -372,7 +376,7 @@ def _exit(canvas: Canvas, room: Room) -> tuple[int, Place]:
 
 
 def _room(canvas: Canvas, size: int, side: int, entry: Place, *, is_first: bool = False) -> Room:
-    """A room of random size with its entry on a side; the first has it in its corner."""
+    """A room of random size with its entry on a side. The first has it in its corner."""
     width, height = canvas.integer(SMALLEST_ROOM, size + 1), canvas.integer(SMALLEST_ROOM, size + 1)
     left, top = entry
     if not is_first:
@@ -411,7 +415,7 @@ class Recipe(NamedTuple):
 
     Attributes:
         draw: function of the parameters below, by name, that returns the layout.
-        parameters: name -> what it may be; "seed" if something is drawn.
+        parameters: name -> what it may be, with "seed" if something is drawn.
         max_steps: the time limit of minigrid, by size and number of rooms.
     """
 

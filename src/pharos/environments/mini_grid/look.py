@@ -1,6 +1,6 @@
 """Appearance of MiniGrid: colours, shapes of walls, lava, doors, things and the player, in the spirit of the package.
 
-Shapes are functions of (colour, pixels of a cell, glyph), see `look.Shape`; x goes right and y down, from 0 to 1.
+Shapes are functions of (colour, pixels of a cell, glyph), see `look.Shape`. x goes right and y down, from 0 to 1.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from pharos.environments.base import Layer, Look
 Mask = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 # In the order of `mini_grid_layouts.COLORS`: blue, green, grey, purple, red, yellow
-PALETTE = ((72, 104, 240), (64, 190, 84), (150, 152, 160), (164, 92, 224), (228, 70, 66), (240, 208, 62))
+GRID_COLORS = ((72, 104, 240), (64, 190, 84), (150, 152, 160), (164, 92, 224), (228, 70, 66), (240, 208, 62))
 SAMPLES = 4  # on each side of a pixel
 DARK = (24, 26, 33)
 
@@ -64,7 +64,7 @@ def goal(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
 
 
 def door(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
-    """A door: open, at the side of the cell; closed, with a handle; locked, with a keyhole in a darker leaf."""
+    """A door: open at the side of the cell, closed with a handle, or locked with a keyhole in a darker leaf."""
     if glyph == "_":
         return painted(cell, (box(0.84, 1, 0, 1), color), (box(0.9, 0.94, 0.06, 0.94), DARK))
     leaf = (box(0, 1, 0, 1), color), (box(0.08, 0.92, 0.08, 0.92), DARK), (box(0.13, 0.87, 0.13, 0.87), color * 0.8)
@@ -89,7 +89,7 @@ KEY_SHAFT = box(0.45, 0.56, 0.44, 0.9)
 
 
 def player(color: np.ndarray, cell: int, glyph: str) -> np.ndarray:
-    """An arrowhead with a pale rim that points where the player looks; what is carried shows behind it."""
+    """An arrowhead with a pale rim that points where the player looks. What is carried shows behind it."""
 
     def arrow(rim: float) -> Mask:
         return lambda x, y: (
@@ -103,8 +103,8 @@ LAYERS = {
     "goal": Layer("G", (74, 200, 96), shape=goal),
     "lava": Layer("~", (240, 122, 36), shape=lava),
     "walls": Layer("#", (112, 116, 126), shape=wall),
-    "doors": Layer(tuple("_DL" * len(PALETTE)), tuple(c for c in PALETTE for _ in range(3)), shape=door),
-    "things": Layer(tuple("KAB" * len(PALETTE)), tuple(c for c in PALETTE for _ in range(3)), shape=thing),
+    "doors": Layer(tuple("_DL" * len(GRID_COLORS)), tuple(c for c in GRID_COLORS for _ in range(3)), shape=door),
+    "things": Layer(tuple("KAB" * len(GRID_COLORS)), tuple(c for c in GRID_COLORS for _ in range(3)), shape=thing),
     "player": Layer(tuple(">v<^"), (236, 64, 60), shape=player),
 }
 LOOK = Look(ground="plain", color="#882255")

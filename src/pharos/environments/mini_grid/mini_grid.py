@@ -1,6 +1,6 @@
 """MiniGrid: rooms with doors and keys, boxes, lava and a goal, for a player who turns and walks.
 
-Source: Chevalier-Boisvert et al. (2023), "Minigrid & Miniworld"; the package minigrid 3.2.0.
+Source: Chevalier-Boisvert et al. (2023), "Minigrid & Miniworld", and the package minigrid 3.2.0.
 """
 
 import re
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from pharos.environments.base import Environment, one_of, parameter, store
-from pharos.environments.mini_grid.layouts import COLORS, FLOOR, GOAL, KINDS, LAVA, PLAYER, WALL, GridLayout
+from pharos.environments.mini_grid.layouts import COLOR_LETTERS, FLOOR, GOAL, KINDS, LAVA, PLAYER, WALL, GridLayout
 from pharos.environments.mini_grid.look import LAYERS, LOOK
 from pharos.errors import ParameterError
 
@@ -20,7 +20,7 @@ OPEN, CLOSED, LOCKED = range(3)  # doors
 KEY, BALL, BOX = range(3)  # things
 FREE, WON, LOST, BLOCKED, DOOR = range(5)  # cells; DOOR + i has door number i
 DOOR_LETTERS, THING_LETTERS = "ODL", "KAB"
-CELLS = {FLOOR: FREE, WALL: BLOCKED, GOAL: WON, LAVA: LOST}
+CELL_KINDS = {FLOOR: FREE, WALL: BLOCKED, GOAL: WON, LAVA: LOST}
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class Level:
     Attributes:
         start: (row, column, direction) of the player.
         cells: (rows, columns) int64: FREE, WON, LOST, BLOCKED, or DOOR + the number of a door.
-        door_conditions, door_colors: of each door at the start; numbers of `COLORS`.
+        door_conditions, door_colors: of each door at the start, as numbers of `COLOR_LETTERS`.
         things: (n, 4) int64: row, column, KEY, BALL or BOX, and colour of each.
-        target_door, target_thing: what pays; -1: none.
+        target_door, target_thing: what pays, -1 for none.
     """
 
     start: tuple[int, int, int]
@@ -45,7 +45,7 @@ class Level:
 
 
 def level_of(layout: GridLayout) -> Level:
-    """The numbers of a layout; ParameterError if its text is none, or if the player can walk out of the grid."""
+    """The numbers of a layout. ParameterError if its text is none, or if the player can walk out of the grid."""
     rows = [re.findall("..", row) for row in layout.rows]
     cells = np.full((len(rows), len(rows[0])), FREE, np.int64)
     starts: list[tuple[int, int, int]] = []
@@ -54,19 +54,19 @@ def level_of(layout: GridLayout) -> Level:
     # Cells, player, doors and things, by their two letters
     for row, texts in enumerate(rows):
         for column, text in enumerate(texts):
-            if text in CELLS:
-                cells[row, column] = CELLS[text]
+            if text in CELL_KINDS:
+                cells[row, column] = CELL_KINDS[text]
             elif text in PLAYER:
                 starts.append((row, column, PLAYER.index(text)))
-            elif text[0] in DOOR_LETTERS and text[1] in COLORS:
+            elif text[0] in DOOR_LETTERS and text[1] in COLOR_LETTERS:
                 cells[row, column] = DOOR + len(doors)
                 doors.append(text)
-            elif text[0] in THING_LETTERS and text[1] in COLORS:
-                things.append((row, column, THING_LETTERS.index(text[0]), COLORS.index(text[1]), text))
+            elif text[0] in THING_LETTERS and text[1] in COLOR_LETTERS:
+                things.append((row, column, THING_LETTERS.index(text[0]), COLOR_LETTERS.index(text[1]), text))
             else:
                 raise ParameterError(
                     f"MiniGrid: level has {text!r} at row {row}, column {column}; expected .. ## GG ~~ >> vv << ^^, or "
-                    f"one of {' '.join(DOOR_LETTERS + THING_LETTERS)} and one of {' '.join(COLORS)}"
+                    f"one of {' '.join(DOOR_LETTERS + THING_LETTERS)} and one of {' '.join(COLOR_LETTERS)}"
                 )
     # One player, a goal or target, and no way out of the grid
     if len(starts) != 1:
@@ -79,7 +79,7 @@ def level_of(layout: GridLayout) -> Level:
         start=starts[0],
         cells=cells,
         door_conditions=np.array([DOOR_LETTERS.index(text[0]) for text in doors], np.int64),
-        door_colors=np.array([COLORS.index(text[1]) for text in doors], np.int64),
+        door_colors=np.array([COLOR_LETTERS.index(text[1]) for text in doors], np.int64),
         things=np.array([numbers[:4] for numbers in things], np.int64).reshape(-1, 4),
         target_door=door,
         target_thing=thing,
@@ -87,7 +87,7 @@ def level_of(layout: GridLayout) -> Level:
 
 
 def layout_rows(text: object) -> tuple[str, ...]:
-    """The rows of a level as text, in capitals except the player; ParameterError if their lengths differ."""
+    """The rows of a level as text, in capitals except the player. ParameterError if their lengths differ."""
     rows = tuple(text.upper().replace("VV", "vv").replace("/", " ").split()) if isinstance(text, str) else ()
     if not rows or len(set(map(len, rows))) > 1 or len(rows[0]) % 2 or len(rows[0]) < 6 or len(rows) < 3:
         raise ParameterError(
@@ -98,7 +98,7 @@ def layout_rows(text: object) -> tuple[str, ...]:
 
 
 def _target(target: str | None, doors: list[str], things: list[str]) -> tuple[int, int]:
-    """(door, thing): number of the target; -1: none."""
+    """(door, thing): number of the target, -1 for none."""
     if target is None:
         return -1, -1
     matches = [(i, -1) for i, text in enumerate(doors) if text == target and text[0] != "O"]
@@ -164,9 +164,9 @@ class MiniGrid(Environment):
              and closes a door, unlocks and opens a locked one with a key of its colour in hand, and opens a box, which
              is empty and vanishes.
     State    (row, column, direction, condition of each door, row and column of each thing). Directions are right,
-             down, left, up; doors are open, closed or locked. A thing at (0, 0) is carried, and a box in
+             down, left, up. Doors are open, closed or locked. A thing at (0, 0) is carried, and a box in
              the other corner of row 0 is gone.
-    Actions  left, right, forward, pickup, drop, toggle, numbered as in minigrid; its seventh, done, does nothing.
+    Actions  left, right, forward, pickup, drop, toggle, numbered as in minigrid. Its seventh, done, does nothing.
     Reward   1 on reaching a goal, opening the door or picking up the thing that is the target, otherwise 0. Minigrid
              pays 1 - 0.9 t / max_steps at step t, which is not of a state: a discount says it better. So do
              `importers.minigrid` and BRIDGE.
@@ -182,11 +182,11 @@ class MiniGrid(Environment):
         size: cells on a side, walls included: of the grid, of a room (unlock, unlock_pickup, key_corridor), or of the
             largest room (multi_room, on 25 x 25 cells). The grid of dist_shift is size - 2 high. None: the
             size in minigrid.
-        seed: of the layout, as given to minigrid's `reset`; None stands for 0.
-        rows: of rooms, in key_corridor; None stands for 3.
-        rooms: how many, in multi_room; None stands for 6.
-        crossings: obstacles to cross, in lava_crossing and simple_crossing; None stands for 1.
-        strip: the row of the second strip of lava, in dist_shift; None stands for 2.
+        seed: of the layout, as for minigrid's `reset`. None stands for 0.
+        rows: of rooms, in key_corridor. None stands for 3.
+        rooms: how many, in multi_room. None stands for 6.
+        crossings: obstacles to cross, in lava_crossing and simple_crossing. None stands for 1.
+        strip: the row of the second strip of lava, in dist_shift. None stands for 2.
         level: a layout of one's own, in place of the above: two characters a cell (see layouts.py), rows
             separated by "/" or line ends, with walls around.
         target: of a level: what to pick up, such as "BR" for the red box, or which door to open, such as "LY"; None:
@@ -240,7 +240,7 @@ class MiniGrid(Environment):
         _ = self.parsed
 
     def _completed(self, name: str, value: int | None) -> int | None:
-        """The default of the kind in place of None; ParameterError if the kind takes other values, or none."""
+        """The default of the kind in place of None. ParameterError if the kind takes other values, or none."""
         declared = KINDS[str(self.kind)].parameters
         if name not in declared:
             if value is None:

@@ -1,4 +1,4 @@
-"""Colosseum's MiniGridEmpty: turn and walk over a grid that never ends an episode; a goal on the far side pays.
+"""Colosseum's MiniGridEmpty: turn and walk over a grid that never ends an episode. A goal on the far side pays.
 
 `RoomGrid` is what it has in common with `mini_grid_rooms`. Source: Conserva and Rauber (2022).
 """
@@ -149,17 +149,17 @@ class MiniGridEmpty(RoomGrid):
 
     State    (row, column, direction: up, right, down, left).
     Start    one of `n_starting_states` cells of one side of the grid, each with a direction, all equally likely.
-    Actions  forward, turn right, turn left; a step into the border changes nothing.
-    Reward   1 for every step that ends on the goal, a turn on it included; otherwise 0.
-    Ends     never. Colosseum's episodic setting is a horizon, such as the limit; its continuous one has none.
+    Actions  forward, turn right, turn left. A step into the border changes nothing.
+    Reward   1 for every step that ends on the goal, a turn on it included, otherwise 0.
+    Ends     never. Colosseum's episodic setting is a horizon, such as the limit. Its continuous one has none.
     Limit    Colosseum's shortest horizon: steps from any state of the start's side to the farthest state, and one more.
-    Chance   with `p_lazy` nothing happens; else with `p_rand` an action that is drawn evenly, as by `random_actions`.
-    Ours     rewards are the means of Colosseum's. Its actions change their numbers from state to state; these do not,
+    Chance   with `p_lazy` nothing happens, else with `p_rand` an action that is drawn evenly, as by `random_actions`.
+    Ours     rewards are the means of Colosseum's. Its actions change their numbers from state to state. These do not,
              which no measure of hardness notices.
     Source   Conserva and Rauber (2022), "Hardness in Markov decision processes: theory and practice".
 
     Attributes:
-        size: of the side; at least 3.
+        size: of the side, at least 3.
         n_starting_states: at most `size` count.
         seed: of the starts and the goal, as Colosseum draws them.
         p_lazy, p_rand: from 0 to 0.9999.

@@ -28,7 +28,7 @@ class MiniGridRooms(RoomGrid):
 
     Attributes:
         n_rooms: a square number, at least 4.
-        room_size: cells on a side of a room; at least 2.
+        room_size: cells on a side of a room, at least 2.
         n_starting_states: at most 4 room_size^2.
         seed: of the starts and the goal, as Colosseum draws them.
         p_lazy, p_rand: from 0 to 0.9999.

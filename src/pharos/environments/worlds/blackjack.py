@@ -21,11 +21,11 @@ BUST = 22
 class Blackjack(Environment):
     """Draw cards to come nearer to 21 than the dealer, who shows one of his two cards, but not beyond it.
 
-    State    total of the player; card that the dealer shows (1: ace); whether an ace counts 11 in the total; whether
-             the first two cards are an ace and a ten (only if that matters); result of the hand.
+    State    total of the player, card that the dealer shows (1: ace), whether an ace counts 11 in the total, whether
+             the first two cards are an ace and a ten (only if that matters), result of the hand.
     Actions  stick, hit, numbered as in Gymnasium.
     Chance   cards come from an infinite deck: 2 to 9 and the ace 1/13 each, tens and faces 4/13. Outcome k of a hit is
-             the card k + 1. Outcomes of sticking are results; their probabilities follow from the dealer's rule: he
+             the card k + 1. Outcomes of sticking are results. Their probabilities follow from the dealer's rule: he
              draws up to 16 and sticks from 17 on, an ace counting 11 if it can.
     Reward   1 for a hand that is won, -1 for one that is lost, 0 for a draw.
     Ends     with a bust, or when the player sticks.
@@ -36,7 +36,7 @@ class Blackjack(Environment):
     Attributes:
         sab: the rules of Sutton and Barto, as `gymnasium.make` has them: a natural, that is an ace and a ten, wins
             unless the dealer has one, too. Else it is a 21 like others.
-        natural: whether a hand won with a natural pays 1.5; only without `sab`.
+        natural: whether a hand won with a natural pays 1.5, only without `sab`.
     """
 
     sab: bool = parameter(True)

@@ -16,13 +16,13 @@ WIDE_TRAIL = ("." * 16,) * 4 + ("." * 6 + "#" * 4 + "." * 6,) * 4 + ("." * 16,) 
 WIDE_BALL = ("." * 16,) * 3 + ("." * 6 + "#" * 4 + "." * 6,) * 6 + ("." * 16,) * 3
 
 # (height, columns, paddle width): first the paper's table, then the drawings of its appendix B
-PAPER = tuple(
+PAPER_SIZES = tuple(
     (height, columns, width) for width in (1, 3) for height, columns in ((12, 10), (12, 8), (16, 8), (20, 8), (24, 8))
 )
-DRAWN = ((14, 8, 1), (14, 10, 3), (20, 10, 1), (20, 10, 3), (24, 10, 3))
+DRAWN_SIZES = ((14, 8, 1), (14, 10, 3), (20, 10, 1), (20, 10, 3), (24, 10, 3))
 INSTANCES = {
     f"{height}x{columns}x{width}": {"height": height, "columns": columns, "extra_paddle_width": (width - 1) // 2}
-    for height, columns, width in (*PAPER, *DRAWN)
+    for height, columns, width in (*PAPER_SIZES, *DRAWN_SIZES)
 }
 INSTANCES |= {  # 923,305,259 and 1,083,934,871 states
     f"{height}x10x1-3rows": {"height": height, "columns": 10, "brick_rows": 3} for height in (20, 30)
@@ -30,7 +30,7 @@ INSTANCES |= {  # 923,305,259 and 1,083,934,871 states
 INSTANCES["6x4x1"] = {"height": 6, "columns": 4}  # 4,620 states, for examples and pages
 
 # found by searches on courts of 11 x 7 and 10 x 8 under three kinds of chance, docs/agents.md
-VECTOR = {
+VECTOR_SETTINGS = {
     "learning_rate": 0.00036,
     "gamma": 0.99,
     "n_steps": 5,
@@ -45,28 +45,28 @@ VECTOR = {
 class Breakout(Environment):
     """A ball, a paddle and `brick_rows` rows of bricks on a court of `height` x `columns` cells.
 
-    Rules    The ball moves one cell diagonally at each step; side walls and the ceiling turn it within the step. Row 0
+    Rules    The ball moves one cell diagonally at each step. Side walls and the ceiling turn it within the step. Row 0
              is free, so the ball can run above the bricks, which fill rows 1 to `brick_rows`. A ball that meets a
              brick breaks it, stays in its cell for that step and turns back vertically. The paddle lies in the bottom
              row and moves first, by at most one cell. A ball is hit by the paddle in the row above it: when the paddle
-             lies ahead of the ball, the ball bounces, one column on in its row, and goes up onwards; when the paddle
+             lies ahead of the ball, the ball bounces, one column on in its row, and goes up onwards. When the paddle
              lies straight below the ball but not ahead, its edge turns the ball back, one column towards where it
              came from. So the player steers by where the paddle is hit, whatever its width, and can reach every brick.
     State    (ball row, ball column, ball goes right, ball goes down, leftmost cell of the paddle, bricks row by row).
-    Start    ball below the middle of the bricks, going down to the right; paddle in the middle; all bricks there.
+    Start    ball below the middle of the bricks, going down to the right, paddle in the middle, all bricks there.
     Actions  left, stay, right.
     Reward   1 a brick, otherwise 0.
-    Ends     when the ball reaches the bottom row; without `respawn` also when no brick is left.
+    Ends     when the ball reaches the bottom row, without `respawn` also when no brick is left.
     Respawn  when no brick is left, all come back as the paddle next hits the ball.
     Limit    1000 steps.
-    Ours     the paper prints height, columns and extra paddle width; brick rows, respawn, angles and limit are ours.
+    Ours     the paper prints height, columns and extra paddle width. Brick rows, respawn, angles and limit are ours.
     Source   the pharos paper, section 3.3 and appendix B.
 
     Attributes:
-        height: rows of the court; at least brick_rows + 4.
+        height: rows of the court, at least brick_rows + 4.
         columns: at least 2 and at least as wide as the paddle.
         brick_rows: at least 1.
-        extra_paddle_width: cells on each side of the paddle's middle; the paddle is 1 + 2 * extra_paddle_width wide.
+        extra_paddle_width: cells on each side of the paddle's middle. The paddle is 1 + 2 * extra_paddle_width wide.
         respawn: whether cleared bricks come back.
     """
 
@@ -99,9 +99,9 @@ class Breakout(Environment):
         ),
     )
     instances = INSTANCES
-    paper_instances = tuple(INSTANCES)[: len(PAPER)]
+    paper_instances = tuple(INSTANCES)[: len(PAPER_SIZES)]
     first_version = 2
-    hyperparameters = {**ARCADE, "dqn": {**ARCADE["dqn"], "vector": VECTOR}}
+    hyperparameters = {**ARCADE, "dqn": {**ARCADE["dqn"], "vector": VECTOR_SETTINGS}}
 
     @property
     def paddle_width(self) -> int:

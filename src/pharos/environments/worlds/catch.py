@@ -11,17 +11,17 @@ BALL_ROW, BALL_COLUMN, PADDLE = range(3)
 class Catch(Environment):
     """Move the paddle in the last row of `rows` x `columns` cells to where the ball falls.
 
-    State    row and column of the ball; column of the paddle.
-    Start    the ball in any column of the first row, each equally likely; the paddle in the middle.
-    Actions  left, stay, right; the ball falls a row with each.
+    State    row and column of the ball, column of the paddle.
+    Start    the ball in any column of the first row, each equally likely, the paddle in the middle.
+    Actions  left, stay, right. The ball falls a row with each.
     Reward   1 for catching the ball, -1 for missing it, when it comes to the last row.
     Ends     when the ball is in the last row.
     Limit    the rows that it falls.
     Source   bsuite catch; Mnih, Heess, Graves and Kavukcuoglu (2014), "Recurrent Models of Visual Attention".
 
     Attributes:
-        rows: of the court; at least 2.
-        columns: of the court; at least 1.
+        rows: of the court, at least 2.
+        columns: of the court, at least 1.
     """
 
     rows: int = parameter(10, low=2, high=1000)

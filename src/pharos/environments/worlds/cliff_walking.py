@@ -13,19 +13,19 @@ SLIPPERY = "write slippery=true"
 
 @dataclass(frozen=True, kw_only=True)
 class CliffWalking(Environment):
-    """Walk from the bottom left to the bottom right of a grid; between the two the bottom row is a cliff.
+    """Walk from the bottom left to the bottom right of a grid. Between the two the bottom row is a cliff.
 
     State    (row, column), counted from the top-left corner.
-    Actions  up, right, down, left, numbered as in Gymnasium; walking into a wall changes nothing.
+    Actions  up, right, down, left, numbered as in Gymnasium. Walking into a wall changes nothing.
     Chance   if it is slippery, an action is executed as itself or as one of the two perpendicular ones, 1/3 each.
-    Reward   -1 a step; a fall over the cliff pays -100 and leads back to the start.
+    Reward   -1 a step. A fall over the cliff pays -100 and leads back to the start.
     Ends     on reaching the goal.
-    Limit    none in Gymnasium; here 25 steps for each cell of the longer side.
+    Limit    none in Gymnasium, here 25 steps for each cell of the longer side.
     Ours     size and limit.
     Source   Gymnasium CliffWalking-v1; Sutton and Barto (2018), "Reinforcement Learning", example 6.6.
 
     Attributes:
-        height, width: of the grid; at least 2 and 3.
+        height, width: of the grid, at least 2 and 3.
         slippery: whether actions slip.
     """
 

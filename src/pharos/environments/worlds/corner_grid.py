@@ -20,18 +20,18 @@ class CornerGrid(Environment):
 
     State    (row, column), counted from the top-left corner.
     Start    one of the `n_starting_states` cells that are nearest to the middle, all equally likely.
-    Actions  up, right, down, left, stay; walking into a wall changes nothing.
-    Chance   with `p_lazy` nothing happens; else with `p_rand` an action that is drawn evenly.
+    Actions  up, right, down, left, stay. Walking into a wall changes nothing.
+    Chance   with `p_lazy` nothing happens, else with `p_rand` an action that is drawn evenly.
     Reward   1 for a step that stays in a paying corner, 0 for one that stays in another corner, 0.5 otherwise.
-    Ends     never. Colosseum's episodic setting is a horizon, such as the limit; its continuous one has none.
+    Ends     never. Colosseum's episodic setting is a horizon, such as the limit. Its continuous one has none.
     Limit    Colosseum's shortest horizon: steps from any possible start to the farthest corner, and one more.
-    Ours     rewards are the means of Colosseum's. Its actions change their numbers from state to state; these do not,
+    Ours     rewards are the means of Colosseum's. Its actions change their numbers from state to state. These do not,
              which no measure of hardness notices.
     Source   SimpleGrid of Colosseum; Conserva and Rauber (2022), "Hardness in Markov decision processes: theory and
              practice".
 
     Attributes:
-        size: of the side; at least 2.
+        size: of the side, at least 2.
         pays: which corners, said of "not left" and "not at the bottom": and (the upper right), nand (the other three),
             or (all but the lower left), xor (the upper left and the lower right).
         n_starting_states: at most (size - 1)^2.

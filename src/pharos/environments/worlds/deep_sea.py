@@ -12,9 +12,9 @@ ROW, COLUMN = range(2)
 
 @dataclass(frozen=True, kw_only=True)
 class DeepSea(Environment):
-    """Dive through `size` rows, to the left or to the right in each; only going right every time finds the treasure.
+    """Dive through `size` rows, to the left or to the right in each. Only going right every time finds the treasure.
 
-    State    (row, column), counted from the top-left corner, where every dive starts; after the last row (size, 0).
+    State    (row, column), counted from the top-left corner, where every dive starts. After the last row (size, 0).
     Actions  first, second: one of them goes right and the other one left, which one is drawn for each cell by
              `mapping_seed`.
     Chance   stochastic: going right stays in its column with probability 1 / size. With `p_rand` an action that is
@@ -23,7 +23,7 @@ class DeepSea(Environment):
              choosing left.
     Ends     after the last row.
     Limit    `size` steps: a dive.
-    Ours     bsuite's stochastic sea adds noise with mean 0 to the rewards in both corners of the last row; rewards here
+    Ours     bsuite's stochastic sea adds noise with mean 0 to the rewards in both corners of the last row. Rewards here
              are the means. bsuite's optimal return, (1 - 1/size)^(size - 1) - move_cost, is for going right every time,
              even if the treasure is lost. The optimum saves the cost from then on and has move_cost (1 - 1/size)^size
              more.
@@ -31,9 +31,9 @@ class DeepSea(Environment):
              Colosseum's DeepSea is `endless_sea`.
 
     Attributes:
-        size: rows and columns; at least 2.
+        size: rows and columns, at least 2.
         stochastic: whether going right may fail.
-        mapping_seed: of the actions, as bsuite draws them; None: the second action goes right everywhere.
+        mapping_seed: of the actions, as bsuite draws them. None: the second action goes right everywhere.
         move_cost: of going right every time.
         left_reward: for each choice of left.
         p_rand: from 0 to 0.9999.

@@ -10,28 +10,28 @@ STEP, RIGHT, CUE, CHOSEN, BITS = range(5)  # the bits follow, one number each
 
 @dataclass(frozen=True, kw_only=True)
 class DelayedChoice(Environment):
-    """Choose the right action at one step; the episode ends, and pays, `lag` steps later.
+    """Choose the right action at one step. The episode ends, and pays, `lag` steps later.
 
-    State    steps taken; the right action; the cue; whether the right action was chosen; `irrelevant_bits` bits.
-    Start    one of the last `cues` actions is right; it and the bits are drawn evenly. The cue is drawn as below.
-    Actions  `num_actions`; only the one at step length - 1 - lag matters, counted from 0.
+    State    steps taken, the right action, the cue, whether the right action was chosen, `irrelevant_bits` bits.
+    Start    one of the last `cues` actions is right. It and the bits are drawn evenly. The cue is drawn as below.
+    Actions  `num_actions`. Only the one at step length - 1 - lag matters, counted from 0.
     Chance   `cue_error`: in each step the cue is the right action, or with this probability the action after it. If it
              is `moving`, it starts anywhere, and moves by the number of the right action.
-    Reward   at the last step 1 if the right action was chosen, else 0; before that 0.
+    Reward   at the last step 1 if the right action was chosen, else 0. Before that 0.
     Ends     after `length` steps.
     Limit    the same.
-    Ours     An umbrella_chain whose lag changes neither the length of episodes nor the number of states; whose bits
-             make 2^n copies of the same MDP; and whose cue can be noisy or move, if `hide=right` hides what is right.
+    Ours     An umbrella_chain whose lag changes neither the length of episodes nor the number of states. Its bits make
+             2^n copies of the same MDP, and its cue can be noisy or move, if `hide=right` hides what is right.
     Source   Ours, after bsuite's umbrella_chain (Osband et al., 2020).
 
     Attributes:
         length: of an episode, in steps.
-        lag: steps between the choice and the last step; below `length`.
+        lag: steps between the choice and the last step, below `length`.
         num_actions: at least 2.
-        cues: how many actions may be right; 1: always the last one.
-        cue_error: from 0 to 0.5; 0 of a moving cue.
+        cues: how many actions may be right. With 1, always the last one.
+        cue_error: from 0 to 0.5, and 0 for a moving cue.
         moving: whether the cue moves, so that two of them say what is right, and one does not.
-        irrelevant_bits: drawn at the start, and never changed; nothing depends on them.
+        irrelevant_bits: drawn at the start, and never changed. Nothing depends on them.
     """
 
     length: int = parameter(8, low=1, high=100_000)

@@ -13,10 +13,10 @@ STEP, CHAIN = range(2)
 
 @dataclass(frozen=True, kw_only=True)
 class DiscountingChain(Environment):
-    """Choose a chain in the first step; each pays once, after a delay of its own, and one of them a bonus.
+    """Choose a chain in the first step. Each pays once, after a delay of its own, and one of them a bonus.
 
-    State    steps taken; the chain (-1 before the first step).
-    Actions  one for each chain; only the first one matters.
+    State    steps taken, the chain (-1 before the first step).
+    Actions  one for each chain. Only the first one matters.
     Reward   1 at the step of the delay of the chain, 1 + bonus on the chain `mapping_seed` modulo their number.
     Ends     after the longest delay.
     Limit    the same.

@@ -21,11 +21,11 @@ class EndlessSea(DeepSea):
              practice".
 
     Attributes:
-        size: rows and columns; at least 2.
+        size: rows and columns, at least 2.
         stochastic: whether going right may fail.
-        mapping_seed: of the actions, as bsuite draws them; None: the second action goes right everywhere.
+        mapping_seed: of the actions, as bsuite draws them. None: the second action goes right everywhere.
         move_cost: of going right every time.
-        left_reward: for each choice of left; None stands for 1 / size^2.
+        left_reward: for each choice of left. None stands for 1 / size^2.
         p_rand: from 0 to 0.9999.
     """
 

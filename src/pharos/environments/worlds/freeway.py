@@ -12,8 +12,8 @@ PLAYER_ROW, PLAYER_TIMER, CARS = range(3)  # positions of the cars follow, then 
 STAY, UP, DOWN = range(3)
 
 SPEEDS = (1, 2, 3, 4, 5, 6, 7, 8, 11)  # least common multiple 9240
-COLORS = ((200, 72, 72), (214, 186, 92), (66, 158, 130), (110, 140, 220), (186, 110, 190))
-NUM_COLORS = len(COLORS)
+CAR_COLORS = ((200, 72, 72), (214, 186, 92), (66, 158, 130), (110, 140, 220), (186, 110, 190))
+NUM_COLORS = len(CAR_COLORS)
 CHICKEN = (  # in pictures for people
     "...##...",
     "...###..",
@@ -71,34 +71,34 @@ class Freeway(Environment):
     """Cross `num_cars` lanes of `lane_length` cells, one car in each, from the bottom to the top.
 
     Rules    The player stays in the middle column and moves up or down one row, at every `player_speed`-th step (the
-             first included); what is chosen in between changes nothing. Then each car moves one cell in its direction
+             first included). What is chosen in between changes nothing. Then each car moves one cell in its direction
              at every `period`-th step, and enters its lane again at the other end. A player whose cell now holds a car
              is hit: back to the start row (`restart_on_hit`), or one row down, as in the Atari game. A player who is
              pushed down onto a car is hit by it only if they still meet at the end of the next step.
     State    (player row, player timer, column of each car from the top lane down, timer of each car). Row 0 is the
-             goal, rows 1 to num_cars are the lanes, row num_cars + 1 is the start; a timer counts the steps since the
+             goal, rows 1 to num_cars are the lanes, row num_cars + 1 is the start. A timer counts the steps since the
              last one at which its owner could move, from 0 to period - 1.
     Start    player in the start row, all cars in the leftmost column (as the paper draws them), all timers at 0.
     Actions  stay, up, down.
     Reward   1 on reaching the top row, -hit_penalty for a hit, otherwise 0.
     Ends     on reaching the top row.
     Limit    1000 steps.
-    Ours     the paper prints num_cars, lane_length and player_speed; speeds, directions, start, penalty and limit are
+    Ours     the paper prints num_cars, lane_length and player_speed. Speeds, directions, start, penalty and limit are
              ours. Its returns lie below zero, hence a penalty and a restart by default.
     Source   the pharos paper, section 3.3 and appendix B.
 
-    All cars together are a clock with lane_length * lcm(periods) phases, which the player cannot influence; the states
+    All cars together are a clock with lane_length * lcm(periods) phases, which the player cannot influence. The states
     are at most that number times num_cars + 2 rows (times player_speed if it does not divide the clock).
 
     Attributes:
-        num_cars: lanes, one car each; at least 1.
-        lane_length: cells of a lane; at least 2. The player's column is lane_length // 2.
-        player_speed: steps between two moves of the player; 1 is fastest.
+        num_cars: lanes, one car each, at least 1.
+        lane_length: cells of a lane, at least 2. The player's column is lane_length // 2.
+        player_speed: steps between two moves of the player. 1 is fastest.
         car_speeds: steps between two moves of each car (1 is fastest), from the top lane down, repeated as often as
             needed. None stands for (1, 2, 3, 4, 5, 6, 7, 8, 11). As text: "1,2,3".
         directions: 1 for a car that goes right, -1 for left, from the top lane down, repeated as often as needed. None
             stands for (1, -1). As text: "1,-1".
-        restart_on_hit: whether a hit sends the player back to the start row; else one row down.
+        restart_on_hit: whether a hit sends the player back to the start row, else one row down.
         hit_penalty: what a hit costs, at least 0.
     """
 
@@ -118,7 +118,7 @@ class Freeway(Environment):
     max_episode_steps = 1000
     layers = {
         "kerb": Layer("=", (142, 142, 142)),
-        "cars": Layer((*">" * NUM_COLORS, *"<" * NUM_COLORS), COLORS * 2, shape="car"),
+        "cars": Layer((*">" * NUM_COLORS, *"<" * NUM_COLORS), CAR_COLORS * 2, shape="car"),
         "player": Layer("@", (252, 252, 84), CHICKEN),
     }
 

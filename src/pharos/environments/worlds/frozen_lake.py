@@ -25,24 +25,24 @@ ATTEMPTS = 10_000
 class FrozenLake(Environment):
     """Walk over a frozen lake to the goal, around the holes.
 
-    State    (row, column), counted from the top-left corner; the episode starts on the tile S.
-    Actions  left, down, right, up, numbered as in Gymnasium; walking into the shore changes nothing.
+    State    (row, column), counted from the top-left corner. The episode starts on the tile S.
+    Actions  left, down, right, up, numbered as in Gymnasium. Walking into the shore changes nothing.
     Reward   1 on reaching the goal, otherwise 0.
     Ends     on reaching the goal or falling into a hole.
     Limit    25 steps for each cell of the longer side: 100 on the 4x4 map and 200 on the 8x8 map, as in Gymnasium.
     Chance   on slippery ice the chosen action is executed, or one of the two perpendicular ones, 1/3 each, and never
              the opposite one. No `random_actions(p)` expresses that, because it executes each action with at least
              p / 4.
-    Ours     the ice is not slippery unless `slippery` says so; in Gymnasium it is unless told otherwise.
+    Ours     the ice is not slippery unless `slippery` says so. In Gymnasium it is by default.
     Source   Gymnasium FrozenLake-v1 (Brockman et al., 2016); the pharos paper, section 3.3.
 
     Attributes:
-        size: 4 or 8 for Gymnasium's maps, or the side of a random map; None stands for 4, or for the size of `map`.
-        map: own map, rows of S (start), F (ice), H (hole) and G (goal) separated by "/", spaces or line ends; one S, at
-            least one G, and a way from S to a G.
+        size: 4 or 8 for Gymnasium's maps, or the side of a random map. None stands for 4, or for the size of `map`.
+        map: own map, rows of S (start), F (ice), H (hole) and G (goal) separated by "/", spaces or line ends. It has
+            one S, at least one G, and a way from S to a G.
         seed: draws a random map of `size` x `size` that has a way to the goal, start top left, goal bottom right.
-        frozen_probability: of each tile of a random map to be ice, in (0, 1]; as in Gymnasium 0.8.
-        slippery: whether the ice is; Gymnasium's `is_slippery`.
+        frozen_probability: of each tile of a random map to be ice, in (0, 1], as in Gymnasium 0.8.
+        slippery: whether the ice is, Gymnasium's `is_slippery`.
     """
 
     size: int | None = parameter(None, kind=int, low=2)

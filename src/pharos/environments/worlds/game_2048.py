@@ -14,7 +14,7 @@ TWO, FOUR = range(1, 3)
 FOURS = 0.1  # of the tiles that appear
 
 GLYPHS = "123456789ABCDEFGH"  # the exponents of tiles
-COLORS = (
+TILE_COLORS = (
     *((238, 228, 218), (237, 224, 200), (242, 177, 121), (245, 149, 99), (246, 124, 95), (246, 94, 59)),
     *((237, 207, 114), (237, 204, 97), (237, 200, 80), (237, 197, 63), (237, 194, 46), (120, 180, 120)),
     *((90, 160, 140), (70, 140, 160), (60, 110, 170), (70, 80, 160), (60, 58, 50)),
@@ -23,7 +23,7 @@ COLORS = (
 
 @dataclass(frozen=True, kw_only=True)
 class Game2048(Environment):
-    """Slide the tiles of a board of `rows` x `columns` cells to one side; equal ones merge into their sum.
+    """Slide the tiles of a board of `rows` x `columns` cells to one side. Equal ones merge into their sum.
 
     State    the tile in each cell, row by row, as its exponent: 0 for an empty cell, 1 for 2, 2 for 4, and so on.
              canonical: boards that are rotations or mirror images of each other are one state, the one that is the
@@ -36,17 +36,17 @@ class Game2048(Environment):
     Reward   objective="score": the sum of the tiles that a move makes, as the game counts it. objective="target": 1 for
              making the target, else 0.
     Ends     when no tile can move, or when the target is made.
-    Limit    none in the game; here half of a bound on the sum of tiles of a board, which no game outlives.
-    Ours     what an impossible move does; boards of other sizes.
+    Limit    none in the game, here half of a bound on the sum of tiles of a board, which no game outlives.
+    Ours     what an impossible move does, and boards of other sizes.
     Source   Cirulli (2014), 2048.
 
     Every move adds what appears to the sum of the tiles, the age of a state: so no state is visited twice.
 
     Attributes:
-        rows, columns: of the board; at least 1, and 2 to 16 cells together.
-        target: the tile that ends the game, a power of two from 8 on; None for an open end.
+        rows, columns: of the board, at least 1, and 2 to 16 cells together.
+        target: the tile that ends the game, a power of two from 8 on. None for an open end.
         objective: "score" or "target".
-        canonical: whether rotations and mirror images are one state; their values are the same.
+        canonical: whether rotations and mirror images are one state. Their values are the same.
     """
 
     rows: int = parameter(3, low=1)
@@ -58,7 +58,7 @@ class Game2048(Environment):
     name = "game_2048"
     actions = ("up", "right", "down", "left")
     version = 1
-    layers = {"tiles": Layer(tuple(GLYPHS), COLORS, shape="power")}
+    layers = {"tiles": Layer(tuple(GLYPHS), TILE_COLORS, shape="power")}
 
     look = Look(color="#E8A33D")
     instances = {

@@ -12,19 +12,19 @@ STEP, QUERY, BITS = range(3)  # the bits follow, one number each
 class MemoryChain(Environment):
     """Say the bit that is asked for, after `memory_length` steps in which actions do nothing.
 
-    State    steps taken; which bit is asked for; `num_bits` bits.
+    State    steps taken, which bit is asked for, `num_bits` bits.
     Start    any bits and any question, all equally likely.
-    Actions  zero, one; only the last one matters.
+    Actions  zero, one. Only the last one matters.
     Reward   1 for the right bit at the last step, -1 for the wrong one.
     Ends     after memory_length + 1 steps.
     Limit    the same.
     Ours     bsuite shows the bits at the start alone and the question at the end alone, so that its agents need a
-             memory. Here the whole state is seen, and is Markov; `hide=` of an observation hides variables always.
+             memory. Here the whole state is seen, and is Markov. `hide=` of an observation hides variables always.
     Source   bsuite memory_chain (memory_len: one bit; memory_size: several).
 
     Attributes:
-        memory_length: steps until the query; at least 1.
-        num_bits: bits to remember; from 1 to 12.
+        memory_length: steps until the query, at least 1.
+        num_bits: bits to remember, from 1 to 12.
     """
 
     memory_length: int = parameter(10, low=1, high=100_000)

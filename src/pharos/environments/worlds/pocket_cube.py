@@ -58,12 +58,12 @@ class PocketCube(Environment):
              right, down front right, down left front, down right back), and how each is twisted: clockwise thirds.
     Start    the solved cube after the turns of `scramble`, or a position drawn by `seed`.
     Actions  U, U2, U', R, R2, R', F, F2, F': the face up, right or front, turned clockwise by a quarter, a half, or
-             three quarters; with `metric=quarter` without the half turns.
+             three quarters. With `metric=quarter` without the half turns.
     Reward   -1 a turn, so that the undiscounted optimal return is minus the least number of turns.
     Ends     when each face has one colour.
-    Limit    50 turns; 11 are enough for every position, 14 quarter turns.
+    Limit    50 turns. 11 are enough for every position, 14 quarter turns.
     Ours     start and limit.
-    Source   Jaap Scherphuis, "Mini Cube, the 2x2x2 Rubik's Cube"; names of faces and places as in H. Kociemba's
+    Source   Jaap Scherphuis, "Mini Cube, the 2x2x2 Rubik's Cube". Names of faces and places as in H. Kociemba's
              two-phase algorithm.
 
     All 7! ways to place the seven corners can be had, with all twists that sum to a multiple of three: 7! * 3^6 =

@@ -17,21 +17,21 @@ class RiverSwim(Environment):
     Start    one of `starts`, all equally likely.
     Actions  left, right.
     Chance   right goes one place forward with probability `forward`, back with `backward`, and stays otherwise. At the
-             left end it goes forward with `forward_at_ends` and else stays; at the right end it stays with that and
-             else goes back. Besides, with `p_lazy` nothing happens; else with `p_rand` an action is drawn evenly.
-    Reward   left_reward for left at the left end, right_reward for right at the right end; if the swimmer stays
-             there, or with `pays_for_action` also if he is swept away.
+             left end it goes forward with `forward_at_ends` and else stays. At the right end it stays with that and
+             else goes back. Besides, with `p_lazy` nothing happens, else with `p_rand` an action is drawn evenly.
+    Reward   left_reward for left at the left end, right_reward for right at the right end. Both are paid if the swimmer
+             stays there, or with `pays_for_action` also if he is swept away.
     Ends     never.
-    Limit    Colosseum's shortest horizon without a current, `length` steps; 20 times that against one.
+    Limit    Colosseum's shortest horizon without a current, `length` steps, 20 times that against one.
     Source   Strehl and Littman (2008), "An analysis of model-based interval estimation for Markov decision processes".
              `osband`: Osband, Russo and Van Roy (2013), "(More) efficient reinforcement learning via posterior
              sampling". `colosseum`: Conserva and Rauber (2022), whose water is still and whose chance is `p_lazy` and
              `p_rand`.
 
     Attributes:
-        length: places; at least 2.
+        length: places, at least 2.
         forward, backward: of right, in the middle.
-        forward_at_ends: of right at both ends; None stands for `forward`.
+        forward_at_ends: of right at both ends. None stands for `forward`.
         left_reward, right_reward: at the ends.
         pays_for_action: whether it is the choice that pays.
         starts: places.

@@ -22,17 +22,17 @@ class SimpleGrid(Environment):
     """Walk over a grid of `height` x `width` cells.
 
     State    (row, column), counted from the top-left corner, where every episode starts.
-    Actions  up, right, down, left; walking into a wall changes nothing and pays nothing.
+    Actions  up, right, down, left. Walking into a wall changes nothing and pays nothing.
     Reward   1 on reaching the goal, the value of a reward or penalty cell on entering it, otherwise 0.
-    Ends     on reaching the goal or a reward cell; penalty cells are walked over.
+    Ends     on reaching the goal or a reward cell. Penalty cells are walked over.
     Limit    4 (height + width) steps.
     Ours     the paper prints neither the rewards nor their cells. We read each pair of blocks of its table as `decoy`
              (a nearer reward cell worth 0.1) and `plain` (the goal alone).
     Source   the pharos paper, section 3.3 and appendix B.
 
     Attributes:
-        height, width: of the grid; at least 1, and at least two cells.
-        goal: (row, column); None stands for the bottom-right corner. As text: "3,3".
+        height, width: of the grid, at least 1, and at least two cells.
+        goal: (row, column). None stands for the bottom-right corner. As text: "3,3".
         rewards: further cells that end the episode, ((row, column), value) each. As text: "2,2:0.1; 0,3:0.5".
         penalties: cells that cost on every entry, ((row, column), value) each with value < 0. As text likewise.
     """

@@ -19,17 +19,17 @@ def _color(i: int) -> Color:
     return red, green, blue
 
 
-COLORS = tuple(map(_color, range(len(NUMBERS))))  # neighbours in the solved order differ in hue
+NUMBER_COLORS = tuple(map(_color, range(len(NUMBERS))))  # neighbours in the solved order differ in hue
 
 
 @dataclass(frozen=True, kw_only=True)
 class SlidingTiles(Environment):
     """Slide the numbered tiles of a tray of `rows` x `columns` cells until they lie in order.
 
-    Rules    One cell is empty. An action moves this blank by one cell; the tile that lay there slides into its place.
+    Rules    One cell is empty. An action moves this blank by one cell. The tile that lay there slides into its place.
              Against the edge of the tray nothing moves.
-    State    the tile in each cell, row by row; 0 is the blank.
-    Start    the tiles from the last to the first, then the blank; if this cannot be solved, with the tiles 1 and 2
+    State    the tile in each cell, row by row, 0 for the blank.
+    Start    the tiles from the last to the first, then the blank. If this cannot be solved, with the tiles 1 and 2
              exchanged. Or another position (`start`), or one drawn by `seed`.
     Actions  up, right, down, left: the way of the blank.
     Reward   -1 a step, so that the undiscounted optimal return is minus the least number of moves.
@@ -43,8 +43,9 @@ class SlidingTiles(Environment):
     last 2 x 2 cells.
 
     Attributes:
-        rows, columns: of the tray; at least 2, and at most 36 cells together.
-        start: the tiles row by row, 0 for the blank; must be solvable, and not solved. As text: "8,6,7,2,5,4,3,0,1".
+        rows, columns: of the tray, at least 2, and at most 36 cells together.
+        start: the tiles row by row, 0 for the blank. They must be solvable, and not solved. As text:
+            "8,6,7,2,5,4,3,0,1".
         seed: draws the start, each solvable position but the solved one with the same probability.
     """
 
@@ -56,7 +57,7 @@ class SlidingTiles(Environment):
     name = "sliding_tiles"
     actions = ("up", "right", "down", "left")
     version = 1
-    layers = {"tiles": Layer(tuple(NUMBERS), COLORS, shape="lettered")}
+    layers = {"tiles": Layer(tuple(NUMBERS), NUMBER_COLORS, shape="lettered")}
 
     look = Look(color="#8C564B")
     instances = {

@@ -29,13 +29,13 @@ MARK = ("........", "........", "..#..#..", "...##...", "...##...", "..#..#..", 
 class Sokoban(Environment):
     """Push every box onto a target. Boxes cannot be pulled, so some pushes can never be made good.
 
-    Rules    A step onto a box pushes it on by one cell, if no wall and no other box lies behind it; else nothing
+    Rules    A step onto a box pushes it on by one cell, if no wall and no other box lies behind it. Otherwise nothing
              happens.
     State    (row, column) of the player, and for each cell of the floor whether a box is there: boxes are all alike, so
              their permutations are one state. The floor are the cells within reach of a player without boxes, row by
              row.
     Actions  up, right, down, left.
-    Reward   -0.1 a step; 1 for each box pushed onto a target, -1 for each pushed off; 10 when all are on targets. So
+    Reward   -0.1 a step, 1 for each box pushed onto a target, -1 for each pushed off, 10 when all are on targets. So
              the undiscounted optimal return is 10 and the boxes not on targets at the start, less 0.1 for each step of
              a shortest solution.
     Ends     when a box is on every target.
@@ -46,11 +46,11 @@ class Sokoban(Environment):
 
     Attributes:
         level: rows of # (wall), - or a space (floor), @ (player), $ (box), . (target), + (player on a target) and *
-            (box on a target), separated by "/" or line ends; or a file of levels, such as Boxoban's, and the number of
+            (box on a target), separated by "/" or line ends. Or a file of levels, such as Boxoban's, and the number of
             one: "000.txt:17". None stands for the level "corner", or for the level of `seed`.
         seed: draws a level of `height` x `width` cells, walls around it included, that can be solved.
-        height, width: of a random level; at least 4.
-        boxes: of a random level; at least 1.
+        height, width: of a random level, at least 4.
+        boxes: of a random level, at least 1.
     """
 
     level: str | None = None
@@ -202,26 +202,26 @@ def boxes_on(targets, state):
 # A level is rows of letters: # wall, @ player, $ box, . target, + player on a target, * box on a target, and - or a
 # space for the floor. In one line rows are separated by "/".
 
-WALL, FLOOR, PLAYER, BOX, TARGET = "#-@$."
-LETTERS = "#-@$.+*"
-ROWS = LETTERS + " _"
+WALL_LETTER, FLOOR_LETTER, PLAYER_LETTER, BOX_LETTER, TARGET_LETTER = "#-@$."
+LEVEL_LETTERS = "#-@$.+*"
+ROW_LETTERS = LEVEL_LETTERS + " _"
 HEADING = r"\W*(?:level|maze|puzzle|title)?\W*(\d+)\W*"
 """A line of a file that numbers a level."""
 WAYS = ((-1, 0), (0, 1), (1, 0), (0, -1))  # up, right, down, left
-OPEN, PULL = 0.75, 0.5  # chance of a cell to be floor, and of a step to pull a box along
-STEPS, ATTEMPTS = 400, 1000
+OPEN_CHANCE, PULL_CHANCE = 0.75, 0.5  # chance of a cell to be floor, and of a step to pull a box along
+STEPS, ROOM_ATTEMPTS = 400, 1000
 LARGEST_FILE = 2**26
 
 Cell = tuple[int, int]
 
 
 def level_text(source: str) -> str:
-    """The level in one line: of a text, or of a file, `levels.txt` or `levels.txt:3`; ValueError says what is wrong.
+    """The level in one line: of a text, or of a file, `levels.txt` or `levels.txt:3`. ValueError says what is wrong.
 
     In a file any line that is no row ends a level. A line with a number, "; 3" or "Level 3", numbers the level after
     it, as in Boxoban's files: then each level needs one. Without such lines levels count from 0.
     """
-    if set(source) <= set(ROWS + "/\n"):
+    if set(source) <= set(ROW_LETTERS + "/\n"):
         rows = re.split(r"[/\n]", source.strip("\n"))
     else:
         file, _, number = source.rpartition(":") if re.search(r":\d+$", source) else (source, "", "0")
@@ -231,14 +231,14 @@ def level_text(source: str) -> str:
             raise ValueError(f"the file has no level {number}; {levels_there}")
         rows = levels[int(number)]
     width = max(map(len, rows))
-    rows = [re.sub("[ _]", FLOOR, row).ljust(width, FLOOR) for row in rows]
-    if not width or set("".join(rows)) - set(LETTERS):
-        raise ValueError(f"expected rows of the letters {LETTERS}")
+    rows = [re.sub("[ _]", FLOOR_LETTER, row).ljust(width, FLOOR_LETTER) for row in rows]
+    if not width or set("".join(rows)) - set(LEVEL_LETTERS):
+        raise ValueError(f"expected rows of the letters {LEVEL_LETTERS}")
     return "/".join(rows)
 
 
 def _levels_of(file: Path) -> dict[int, list[str]]:
-    """The rows of each level of a file by its number; ValueError if it is not clear which is which."""
+    """The rows of each level of a file by its number. ValueError if it is not clear which is which."""
     from pharos.system.storage import check_regular  # which levels in text do without
 
     try:
@@ -252,17 +252,19 @@ def _levels_of(file: Path) -> dict[int, list[str]]:
     boards: dict[int, list[str]] = {}  # first line -> rows
     first = None
     for at, line in enumerate(lines, 1):
-        if set(line) & set("#@$.+*") and set(line) <= set(ROWS):
+        if set(line) & set("#@$.+*") and set(line) <= set(ROW_LETTERS):
             first = first or at
             boards.setdefault(first, []).append(line.rstrip())
             continue
         first = None
-        if WALL in line and set(line) <= set(ROWS + "|()pPbB0123456789"):
-            raise ValueError(f"line {at} has run lengths or other letters, {line[:40]!r}; expected rows of {LETTERS}")
+        if WALL_LETTER in line and set(line) <= set(ROW_LETTERS + "|()pPbB0123456789"):
+            raise ValueError(
+                f"line {at} has run lengths or other letters, {line[:40]!r}; expected rows of {LEVEL_LETTERS}"
+            )
         heading = re.fullmatch(HEADING, line, re.IGNORECASE)
         if heading:
             numbers[at] = int(heading[1])
-    boards = {at: rows for at, rows in boards.items() if any(WALL in row for row in rows)}
+    boards = {at: rows for at, rows in boards.items() if any(WALL_LETTER in row for row in rows)}
     if not numbers:
         return dict(enumerate(boards.values()))
     order, levels = sorted([*numbers, *boards]), {}
@@ -286,7 +288,7 @@ def within_reach(text: str) -> tuple[list[Cell], dict[Cell, str]]:
         row, column = frontier.pop()
         for down, right in WAYS:
             cell = row + down, column + right
-            if letters.get(cell, WALL) != WALL and cell not in reachable:
+            if letters.get(cell, WALL_LETTER) != WALL_LETTER and cell not in reachable:
                 reachable.add(cell)
                 frontier.append(cell)
     return sorted(reachable), letters
@@ -298,15 +300,15 @@ def random_level(height: int, width: int, boxes: int, seed: int) -> str:
     Source: ours, after the reverse play of Racaniere et al. (2017), appendix.
     """
     rng = np.random.Generator(np.random.PCG64(seed))
-    for _ in range(ATTEMPTS):
+    for _ in range(ROOM_ATTEMPTS):
         is_floor = np.zeros((height, width), np.bool_)
-        is_floor[1:-1, 1:-1] = rng.random((height - 2, width - 2)) < OPEN
+        is_floor[1:-1, 1:-1] = rng.random((height - 2, width - 2)) < OPEN_CHANCE
         cells = [(int(y), int(x)) for y, x in np.argwhere(is_floor)]
         if len(cells) <= boxes + 1:
             continue
         player, *targets = (cells[i] for i in np.argsort(rng.random(len(cells)))[: boxes + 1])
         free, placed = set(cells), set(targets)
-        for step, pulls in zip(rng.integers(0, 4, STEPS), rng.random(STEPS) < PULL, strict=True):
+        for step, pulls in zip(rng.integers(0, 4, STEPS), rng.random(STEPS) < PULL_CHANCE, strict=True):
             down, right = WAYS[step]
             ahead, behind = ((player[0] + sign * down, player[1] + sign * right) for sign in (1, -1))
             if ahead not in free or ahead in placed:
@@ -319,10 +321,14 @@ def random_level(height: int, width: int, boxes: int, seed: int) -> str:
         text = _text(height, width, free, player, placed, set(targets))
         if {*placed, *targets} <= set(within_reach(text)[0]):
             return text
-    raise ValueError(f"none of {ATTEMPTS} random levels has its {boxes} boxes off their targets")
+    raise ValueError(f"none of {ROOM_ATTEMPTS} random levels has its {boxes} boxes off their targets")
 
 
 def _text(height: int, width: int, free: set[Cell], player: Cell, boxes: set[Cell], targets: set[Cell]) -> str:
-    letters = {**dict.fromkeys(free, FLOOR), **dict.fromkeys(targets, TARGET), **dict.fromkeys(boxes, BOX)}
-    letters[player] = "+" if player in targets else PLAYER
-    return "/".join("".join(letters.get((y, x), WALL) for x in range(width)) for y in range(height))
+    letters = {
+        **dict.fromkeys(free, FLOOR_LETTER),
+        **dict.fromkeys(targets, TARGET_LETTER),
+        **dict.fromkeys(boxes, BOX_LETTER),
+    }
+    letters[player] = "+" if player in targets else PLAYER_LETTER
+    return "/".join("".join(letters.get((y, x), WALL_LETTER) for x in range(width)) for y in range(height))

@@ -30,9 +30,9 @@ class Taxi(Environment):
 
     State    (row, column) of the taxi, the landmark where the passenger is (or their number: in the taxi), his
              destination, and whether he may still change his mind.
-    Start    the taxi anywhere, the passenger at a landmark, his destination another one; each with the same
+    Start    the taxi anywhere, the passenger at a landmark, his destination another one, each with the same
              probability.
-    Actions  down, up, right, left, pick up, set down, numbered as in Gymnasium; walls stop the taxi.
+    Actions  down, up, right, left, pick up, set down, numbered as in Gymnasium. Walls stop the taxi.
     Chance   rainy: a move that no wall stops goes its way with `rainy_probability`, else to its left or right, with the
              same probability, if walls do not stop that.
              fickle: the first time that the taxi changes its cell with the passenger in it, he takes another
@@ -40,14 +40,14 @@ class Taxi(Environment):
     Reward   -1 a step, -10 for picking up or setting down if that is impossible, 20 for setting him down at his
              destination. He can be set down at landmarks only.
     Ends     when he is set down at his destination.
-    Limit    200 steps on 5 x 5 cells, as in Gymnasium; 8 for each cell.
-    Ours     sizes. Gymnasium draws before the first step whether he will change his mind, and hides it; here it is
+    Limit    200 steps on 5 x 5 cells, as in Gymnasium, 8 for each cell.
+    Ours     sizes. Gymnasium draws before the first step whether he will change his mind, and hides it. Here it is
              drawn when it shows, which is the same in law, and the state says whether that is still to come.
     Source   Gymnasium Taxi-v4; Dietterich (2000), "Hierarchical Reinforcement Learning with the MAXQ Value Function
              Decomposition", JAIR 13.
 
     Attributes:
-        size: of the town; 5 has Gymnasium's landmarks and walls, others have landmarks in the corners and no walls.
+        size: of the town. 5 has Gymnasium's landmarks and walls, others have landmarks in the corners and no walls.
         landmarks: own ones, from 2 to 9 cells (row, column). As text: "0,0; 0,4; 4,0".
         walls: own ones, cells (row, column) with a wall to their right. As text likewise.
         rainy, fickle: the two kinds of chance.

@@ -10,15 +10,15 @@ LEAVE, TAKE = range(2)
 
 @dataclass(frozen=True, kw_only=True)
 class UmbrellaChain(Environment):
-    """Take an umbrella or leave it in the first step; after `chain_length` steps it shows whether that was right.
+    """Take an umbrella or leave it in the first step. After `chain_length` steps it shows whether that was right.
 
-    State    steps taken; whether an umbrella is needed; whether there is one.
+    State    steps taken, whether an umbrella is needed, whether there is one.
     Start    needed or not, there or not, all equally likely.
-    Actions  leave, take; only the first one matters.
-    Reward   at the last step 1 if an umbrella is there exactly when it is needed, else -1; before that 0.
+    Actions  leave, take. Only the first one matters.
+    Reward   at the last step 1 if an umbrella is there exactly when it is needed, else -1. Before that 0.
     Ends     after `chain_length` steps.
     Limit    the same.
-    Ours     bsuite pays 1 or -1 by the toss of a coin at each step but the last, which has mean 0; rewards here are the
+    Ours     bsuite pays 1 or -1 by the toss of a coin at each step but the last, which has mean 0. Rewards here are the
              means. Its distractors are random numbers beside the observation and no part of a state.
     Source   bsuite umbrella_chain (umbrella_length, umbrella_distract).
 

@@ -16,7 +16,8 @@ NETWORKS = 20  # random ones, if there is no closed form
 
 
 def kernel_of_module(network: object, shape: tuple[int, ...]) -> tuple[Callable[..., np.ndarray], dict[str, Any]]:
-    """Return (kernel of inputs x, y; its description) of a function of a shape that makes networks, or of its name."""
+    """Return (kernel of inputs x and y, its description) of a function of a shape that makes networks, or of its
+    name."""
     source = sources.find_source(network) if isinstance(network, str) else sources.source_of(network)
     function = sources.load_source(source) if isinstance(network, str) and source is not None else network
     name = source.name if source is not None else str(getattr(network, "__name__", network))
@@ -47,14 +48,14 @@ def empirical_ntk(
     Args:
         make: () -> a torch.nn.Module from inputs (N, ...) to outputs (N, A), with parameters drawn anew.
         x: (N, ...) inputs, see `network_inputs`.
-        others: (M, ...) inputs y; None: x.
-        networks: how many; the standard error falls with the square root.
+        others: (M, ...) inputs y. Default: x.
+        networks: how many. The standard error falls with the square root.
         seed: of PyTorch's random numbers, which are left as they were.
     Returns:
-        (N, M) float32; symmetric if `others` is None.
+        (N, M) float32, symmetric if `others` is None.
     Raises:
-        MissingExtra: PyTorch is not installed. ParameterError: no network, or none was asked for; its outputs are not
-            (N, A), or its gradients are not finite.
+        MissingExtra: PyTorch is not installed. ParameterError: no network, none was asked for, its outputs are not (N,
+        A), or its gradients are not finite.
     Cost: `networks` times N + M gradients, which lie in memory one network at a time.
     Source: Jacot, Gabriel and Hongler (2018).
     """

@@ -3,7 +3,7 @@
 `kernel_regret`, Q-learning: an idealised DQN. Its network is replaced by its tangent kernel, its replay buffer by the
 exact expected visits of its own behaviour, its targets by exact expectations. With the identity in the place of the
 kernel it is tabular Q-learning, the same learner without a representation. So is hardness defined by GORP (Laidlaw et
-al., 2023) and SQIRL (2024), as the cost of an idealised algorithm; here the algorithm's function class is the agent's,
+al., 2023) and SQIRL (2024), as the cost of an idealised algorithm. Here the algorithm's function class is the agent's,
 and its cost is not sampled.
 
 `kernel_policy_regret`, an actor-critic: an idealised PPO. Policy and values are functions in the space of the network's
@@ -50,11 +50,11 @@ class KernelRegret:
     """Regret of the idealised learner, with the kernel and without it.
 
     Attributes:
-        curve: with the kernel; tabular: with the identity in its place, on the states themselves.
-        observations: different ones that it learns from; states: that can be met and are not terminal.
-        landmarks: of the approximation; None: the kernel is exact.
+        curve: with the kernel. tabular: with the identity in its place, on the states themselves.
+        observations: different ones that it learns from. states: that can be met and are not terminal.
+        landmarks: of the approximation. None: the kernel is exact.
         estimated_error, estimated_error_played: half of the landmarks change the regret of the greedy policies, and
-            what is played, by that much: estimates, not bounds; 0 if exact.
+            what is played, by that much: estimates, not bounds. 0 if exact.
         conventions: schedule, episode, observation and network.
         name: of the measure.
     """
@@ -76,7 +76,7 @@ class KernelRegret:
 
     @property
     def note(self) -> str:
-        """Landmarks and the error that they are estimated to cause; empty if the kernel is exact."""
+        """Landmarks and the error that they are estimated to cause. Empty if the kernel is exact."""
         if self.landmarks is None:
             return ""
         return (
@@ -132,21 +132,21 @@ def kernel_regret(
     The value is the mean over phases of (V* - V of the greedy policy) / (V* - V of uniform play).
 
     Args:
-        representation: the kernel; see `pharos.observations.representation`.
+        representation: the kernel, see `pharos.observations.representation`.
         schedule: None: the default of `Schedule`.
         solution: the optimal values of `mdp`, if they are known.
-        horizon: steps of an episode that the learner sees; None: the MDP's, else the time limit.
-        progress: called with a line now and then; an exception of its own ends the computation.
+        horizon: steps of an episode that the learner sees. Default: the MDP's, else the time limit.
+        progress: called with a line now and then. An exception that it raises ends the computation.
     Returns:
         A KernelRegret. Actions whose values are within 1e-6 of the state's largest one are chosen alike. Values are in
         the MDP's setting (gamma, horizon). What agents see is the state, not the previous action: under sticky actions
         a target is the mean over previous actions, weighted by visits. Rewards are expected ones: their noise is drawn
         by `sampled_regret` alone.
     Raises:
-        UndefinedMeasure: there is neither a horizon nor a time limit; or uniform play is optimal.
+        UndefinedMeasure: there is neither a horizon nor a time limit, or uniform play is optimal.
         ParameterError: the representation is of other states, or its kernel does not fit into memory.
     Cost: for each phase about 4 sqrt(g) products of the kernel with A columns, walks of T steps and two values. The
-        kernel is 4 C^2 bytes of C different observations; beyond MOST_EXACT of them, landmarks.
+        kernel is 4 C^2 bytes of C different observations, with landmarks beyond 4,096 of them.
     Source: pharos; Sirignano and Spiliopoulos (2019), Cai et al. (2019) for the limit of wide networks.
     """
     learner = IdealisedLearner(mdp, representation, schedule, horizon, solution, progress)
@@ -212,25 +212,25 @@ def kernel_policy_regret(
     which goes up PPO's objective E[p / pi A]. With `rollouts.clip_range` it is clipped: an action of a state whose p /
     pi is above 1 + clip_range is no longer pushed up, one below 1 - clip_range no longer down. eta is 1 / (1.05 times
     the largest eigenvalue of K diag(d)), d of states: no learning rate, and what K learns slowly stays slow.
-    The value is the mean over rollouts of (V* - V of the most probable actions) / (V* - V of uniform play); as played,
-    the same of pi, weighted by episodes; as evaluated, the same of pi with all rollouts alike, which is what
+    The value is the mean over rollouts of (V* - V of the most probable actions) / (V* - V of uniform play). As played,
+    the same of pi, weighted by episodes. As evaluated, the same of pi with all rollouts alike, which is what
     evaluations of the distribution over actions see.
 
     Args:
-        representation: the kernel; of an actor-critic `initialisation="sb3"`.
-        schedule: for its steps, discount and optimizer; None: the default of `Schedule`.
+        representation: the kernel, of an actor-critic `initialisation="sb3"`.
+        schedule: for its steps, discount and optimizer. Default: the default of `Schedule`.
         rollouts: None: the defaults of `Rollouts`.
         solution: the optimal values of `mdp`, if they are known.
-        horizon: steps of an episode that the learner sees; None: the MDP's, else the time limit.
-        progress: called with a line now and then; an exception of its own ends the computation.
+        horizon: steps of an episode that the learner sees. Default: the MDP's, else the time limit.
+        progress: called with a line now and then. An exception that it raises ends the computation.
     Returns:
-        A KernelRegret; a phase is a rollout. Actions whose logits are within 1e-6 of the state's largest one are
-        chosen alike by the greedy policy. Values are in the MDP's setting (gamma, horizon). Under sticky actions
+        A KernelRegret, in which a phase is a rollout. Actions whose logits are within 1e-6 of the state's largest one
+        are chosen alike by the greedy policy. Values are in the MDP's setting (gamma, horizon). Under sticky actions
         returns are means over previous actions, weighted by visits.
     Raises:
-        UndefinedMeasure: there is neither a horizon nor a time limit; or uniform play is optimal.
+        UndefinedMeasure: there is neither a horizon nor a time limit, or uniform play is optimal.
         ParameterError: the representation is of other states, or its kernel does not fit into memory.
-    Cost: for each rollout g products of the kernel with A columns, and 4 sqrt(g) with one; a walk of T steps, two
+    Cost: for each rollout g products of the kernel with A columns, and 4 sqrt(g) with one, a walk of T steps, two
         values, and up to 14 / (1 - gamma lambda) backups. Landmarks as in `kernel_regret`.
     Source: pharos; Sutton et al. (2000) for the gradient, Schulman et al. (2016) for G, Schulman et al. (2017) for the
         objective, Agarwal et al. (2021) for tables.
@@ -280,7 +280,7 @@ class PolicyLearner(IdealisedLearner):
     def _returns(
         self, memory: Memory, policy: np.ndarray, v: np.ndarray, begin: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """((N, A), (N, A)): expected returns G of each choice, from values v (N,); and its visits."""
+        """((N, A), (N, A)): expected returns G of each choice, from values v (N,), and its visits."""
         share, returns = self.rollouts.gae_lambda, begin
         for _ in range(MOST_BACKUPS):
             after = (1 - share) * v + share * (policy * returns).sum(axis=1)
@@ -296,8 +296,8 @@ def ascended(
     """Logits (C, A) after gradient steps up the sum of pull(., a) p(a) / pi(a), pi their policy before the first.
 
     Args:
-        pull: (C, A) weighted advantages, summed over the states of an observation; up: the positive ones alone.
-        rollouts: how many steps; if p / pi is `clip_range` above 1 the positive ones count no more, if it is as
+        pull: (C, A) weighted advantages, summed over the states of an observation. up: the positive ones alone.
+        rollouts: how many steps. If p / pi is `clip_range` above 1 the positive ones count no more, if it is as
             far below the negative ones. Logits of actions that are not available are -inf.
     """
     behaviour = np.maximum(softmax(logits), 1e-30)
@@ -320,7 +320,7 @@ def softmax(logits: np.ndarray) -> np.ndarray:
 
 
 def standardised(advantages: np.ndarray, visits: np.ndarray) -> np.ndarray:
-    """(N, A) of mean 0 and variance 1 under visits of sum 1; 0 if they are all the same."""
+    """(N, A) of mean 0 and variance 1 under visits of sum 1, or 0 if they are all the same."""
     centred = advantages - (visits * advantages).sum()
     spread = float(np.sqrt((visits * centred**2).sum()))
     return centred / spread if spread > 1e-12 else np.zeros_like(centred)
@@ -341,10 +341,10 @@ class Spectral:
     """A number that follows from a kernel's spectrum.
 
     Attributes:
-        value: the number, at least 1; infinite if it is beyond what was looked at.
-        observations: different ones that were decomposed; of how many: `of`.
+        value: the number, at least 1. Infinite if it is beyond what was looked at.
+        observations: different ones that were decomposed. of: out of how many.
         estimated_error: with half of the observations drawn the natural logarithm differs by that much: an estimate of
-            the error, not a bound; 0 if all were decomposed.
+            the error, not a bound. 0 if all were decomposed.
         conventions: what it refers to.
     """
 
@@ -357,7 +357,7 @@ class Spectral:
 
     @property
     def note(self) -> str:
-        """Sampled observations and the error that they are estimated to cause; empty if all were decomposed."""
+        """Sampled observations and the error that they are estimated to cause. Empty if all were decomposed."""
         if self.observations == self.of:
             return ""
         return (
@@ -391,9 +391,9 @@ def kernel_learning_time(
     optimal play; v_i: the energy of A* = Q* - V* (all actions) on its eigenvectors.
 
     Args:
-        schedule: for its discount, which Q* has; None: the default of `Schedule`.
-        horizon: steps of an episode, for visits; None: the MDP's, else the time limit.
-        progress: called with a line now and then; an exception of its own ends the computation.
+        schedule: for its discount, which Q* has. Default: the default of `Schedule`.
+        horizon: steps of an episode, for visits. Default: the MDP's, else the time limit.
+        progress: called with a line now and then. An exception that it raises ends the computation.
     Raises:
         UndefinedMeasure: there are no episodes, or every action is optimal everywhere.
         ParameterError: the representation is of other states.
@@ -450,12 +450,12 @@ def aliasing_floor(
 ) -> float:
     """Return the share of the variance of Q* that no function of the observation explains: E Var(Q* | o) / Var Q*.
 
-    Visits and arguments as for `kernel_learning_time`; summed over actions. 0 if the observation tells the state.
+    Visits and arguments as for `kernel_learning_time`, summed over actions. 0 if the observation tells the state.
 
     Raises:
         UndefinedMeasure: there are no episodes, or Q* is the same everywhere.
     Cost: values and two occupancies.
-    Source: pharos; the law of total variance.
+    Source: pharos, by the law of total variance.
     """
     setting = _setting(mdp, representation, schedule, horizon, "aliasing_floor", progress or str)
     states = np.flatnonzero(setting.states > 0)
@@ -484,7 +484,7 @@ def _setting(
 
 
 def _centred(q: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Values q (N, A) less the mean of their action under weights (N,); 0 for actions that are not available (-inf)."""
+    """Values q (N, A) less the mean of their action under weights (N,). 0 for actions that are not available (-inf)."""
     if np.isfinite(q).all():
         return np.asarray(q - weights @ q)
     is_available = np.isfinite(q)
@@ -503,7 +503,7 @@ def _spectral(
     function: Callable[[np.ndarray, np.ndarray, np.ndarray], float],
     report: Callable[[str], object],
 ) -> Spectral:
-    """Spectral result of a function of (kernel (C, C), weights (C,), mean values (C, A)) of the observations; values of
+    """Spectral result of a function of (kernel (C, C), weights (C,), mean values (C, A)) of the observations. Values of
     actions that are not available are -inf."""
     setting = _setting(mdp, representation, schedule, horizon, name, report)
     states = np.flatnonzero(setting.states > 0)

@@ -20,22 +20,22 @@ from pharos.mdp import TabularMDP, mdp_within, states_within, uniform_choice, wh
 from pharos.regret import regret_scale
 from pharos.solvers import Solution, chain, evaluate_policy, uniform_value, value_iteration
 
-MOST_EXACT = 4096
+MOST_WITHOUT_LANDMARKS = 4096
 """Different observations up to which a kernel is used as it is; beyond, by landmarks."""
 DEFAULT_LANDMARKS = 600
 
 
 @dataclass(frozen=True, eq=False)
 class Representation:
-    """An observation and a network, as measures see them; `pharos.observations.representation` makes one.
+    """An observation and a network, as measures see them. `pharos.observations.representation` makes one.
 
     Attributes:
-        kernel: (rows (N,), columns (M,)) of states -> (N, M) float32, the network's tangent kernel; positive
+        kernel: (rows (N,), columns (M,)) of states -> (N, M) float32, the network's tangent kernel. Positive
             semidefinite, and symmetric if rows are columns.
         classes: (S,) the number of each state's observation, from 0: states of one number look alike.
-        time_limit: steps of an episode that the agent sees, if the MDP has no horizon; or None.
-        landmarks: of the approximation beyond MOST_EXACT different observations; 0: none, whatever it takes; 2 or more:
-            for all sizes.
+        time_limit: steps of an episode that the agent sees, if the MDP has no horizon, or None.
+        landmarks: of the approximation beyond MOST_WITHOUT_LANDMARKS different observations. 0 means none, whatever it
+            takes. 2 or more are used for all sizes.
         conventions: what it is, JSON-able.
     """
 
@@ -51,7 +51,8 @@ class Representation:
 
     @staticmethod
     def of_matrix(kernel: ArrayLike, classes: ArrayLike | None = None, **options: Any) -> "Representation":
-        """Make a representation of a kernel (S, S) and numbers of observations (S,); None: every state looks different.
+        """Make a representation of a kernel (S, S) and numbers of observations (S,). Default: every state looks
+        different.
 
         Raises:
             ParameterError: it is not square, symmetric and finite, there is not one number for each state, or there
@@ -89,13 +90,13 @@ class Grouped:
     Attributes:
         representatives: (C,) one state of each observation.
         groups: (N,) the observation of each of the states, 0 .. C - 1.
-        sets: (C, A) bool, the available actions; None: all are.
+        sets: (C, A) bool, the available actions. None: all are.
     Raises:
         UndefinedMeasure: states that look alike do not have the same actions.
     """
 
     def __init__(self, classes: np.ndarray, states: np.ndarray, available: np.ndarray | None = None):
-        """available: (S, A) bool, the available actions of the states; None: all are."""
+        """available: (S, A) bool, the available actions of the states. None: all are."""
         _, first, groups = np.unique(classes[states], return_index=True, return_inverse=True)
         self.representatives, self.groups = states[first], groups.ravel()
         self.sets = None if available is None else available[self.representatives]
@@ -134,7 +135,7 @@ Kernel = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 class KernelOperator:
-    """A positive semidefinite kernel K of C observations; z is (C, A) float64."""
+    """A positive semidefinite kernel K of C observations. z is (C, A) float64."""
 
     def __call__(self, z: np.ndarray) -> np.ndarray:
         """K z."""
@@ -143,7 +144,7 @@ class KernelOperator:
     def largest_eigenvalue(self, weights: np.ndarray, vector: np.ndarray) -> float:
         """The largest eigenvalue of K diag(weights), weights (C, 1), to 0.1 %, by Lanczos' method from `vector` (C, 1).
 
-        Returns it with the residual added, so that it is not too small; `vector` becomes the eigenvector found.
+        Returns it with the residual added, so that it is not too small. `vector` becomes the eigenvector found.
         """
         root = np.sqrt(weights)
         vector *= 1.0 if vector.sum() >= 0 else -1.0
@@ -168,16 +169,17 @@ class KernelOperator:
             beside.append(length)
 
     def preconditioned(self, weights: np.ndarray) -> None:
-        """Become W^-1/2 (W^1/2 K W^1/2)^1/2 W^-1/2, the kernel of full-matrix Adam; W the weights (C,) of observations.
+        """Become W^-1/2 (W^1/2 K W^1/2)^1/2 W^-1/2, the kernel of full-matrix Adam, where W are the weights (C,) of
+        observations.
 
-        Its second moments of gradients are J' W J for errors of one size, J the network's Jacobian, K = J J'; dividing
+        Its second moments of gradients are J' W J for errors of one size, J the network's Jacobian, K = J J'. Dividing
         gradients by their square root leaves each eigenvalue of K under W as its square root. Weights are positive.
         Source: Duchi, Hazan and Singer (2011) for full matrices; Kingma and Ba (2015) keep the diagonal alone.
         """
         raise NotImplementedError
 
     def parts(self, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(K (C, C), F (C, 0), diagonal (0,)), or K = F F' + diag as ((0, 0), F (C, m), (C,)); all float32."""
+        """(K (C, C), F (C, 0), diagonal (0,)), or K = F F' + diag as ((0, 0), F (C, m), (C,)), all float32."""
         raise NotImplementedError
 
     def descended(self, weights: np.ndarray, error: np.ndarray, rate: float, steps: int) -> np.ndarray:
@@ -323,13 +325,13 @@ class Schedule:
 
     Attributes:
         steps: of the environment.
-        period: steps between copies of the target network; a phase.
+        period: steps between copies of the target network. They are a phase.
         gradient_steps: in a phase.
         learning_starts: steps before the first gradient step.
         exploration_initial_eps, exploration_final_eps, exploration_fraction: epsilon falls linearly from one to the
-            other over this share of the steps; before `learning_starts` it is 1.
-        gamma: the learner's own discount; values have the MDP's.
-        optimizer: "gradient", descent with the largest step that does not overshoot; or "adam", the same with gradients
+            other over this share of the steps. Before `learning_starts` it is 1.
+        gamma: the learner's own discount. Values have the MDP's.
+        optimizer: "gradient", descent with the largest step that does not overshoot, or "adam", the same with gradients
             rescaled as by full-matrix Adam at the standard occupancy, see `KernelOperator.preconditioned`.
     """
 
@@ -373,7 +375,7 @@ class Rollouts:
         gradient_steps: that they learn by.
         gae_lambda: weight of longer returns, in returns and advantages.
         clip_range: PPO's: how far the probability of an action moves, as a share of itself, before it is no longer
-            pushed further; None: without.
+            pushed further. None: no clipping.
     """
 
     steps: int = 512
@@ -390,7 +392,7 @@ class Rollouts:
             raise ParameterError(f"rollouts: clip_range is {self.clip_range!r}; expected a number above 0, or None")
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able; without `clip_range` if there is none, as it was before there could be one."""
+        """JSON-able. Without `clip_range` if there is none, as it was before there could be one."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
@@ -412,17 +414,17 @@ class LearningCurve:
 
     @property
     def mean_greedy(self) -> float:
-        """Mean over phases; a policy counts at most WORST_GREEDY."""
+        """Mean over phases. A policy counts at most WORST_GREEDY."""
         return float(np.minimum(self.greedy, WORST_GREEDY).mean())
 
     @property
     def mean_played(self) -> float:
-        """Mean over episodes; a policy counts at most WORST_PLAYED."""
+        """Mean over episodes. A policy counts at most WORST_PLAYED."""
         return float(np.average(np.minimum(self.played, WORST_PLAYED), weights=self.episodes))
 
     @property
     def mean_evaluated(self) -> float:
-        """Mean over phases of what is played, as evaluations at equal distances see it; at most WORST_GREEDY each."""
+        """Mean over phases of what is played, as evaluations at equal distances see it, at most WORST_GREEDY each."""
         return float(np.minimum(self.played, WORST_GREEDY).mean())
 
     def to_dict(self) -> dict[str, Any]:
@@ -436,10 +438,10 @@ class IdealisedLearner:
     Attributes:
         measure: its name in errors and notes.
         step_weights: how d weighs the kernel in the step size, in words.
-        whole: the MDP as given; mdp: without states that its horizon keeps out of reach.
-        states: (N,) those that an episode can reach and that are not terminal; numbers: (N,) in the MDP as given.
+        whole: the MDP as given. mdp: without states that its horizon keeps out of reach.
+        states: (N,) those that an episode can reach and that are not terminal. numbers: (N,) in the MDP as given.
         episode: its steps.
-        observations: the states by what the agent sees; table: each for itself.
+        observations: the states by what the agent sees. table: each for itself.
     Raises:
         UndefinedMeasure: uniform play is optimal, so that regret has no scale.
     """
@@ -456,7 +458,7 @@ class IdealisedLearner:
         solution: Solution | None = None,
         progress: Callable[[str], object] | None = None,
     ):
-        """progress: called with a line for each phase; an exception of its own ends the learning."""
+        """progress: called with a line for each phase. An exception that it raises ends the learning."""
         self.report = progress or str
         self.episode = episode = representation.episode(mdp, horizon, self.measure)
         self.schedule, self.representation = schedule or Schedule(), representation
@@ -515,11 +517,11 @@ class IdealisedLearner:
         return self.observations.sums(standard.states[self.numbers])
 
     def operators(self) -> tuple[Iterable[KernelOperator], int | None]:
-        """([the kernel over observations], None); or, if they are too many, (the kernel by landmarks, then by half
-        of them; the number of landmarks), drawn by `weights`."""
+        """([the kernel over observations], None). If they are too many, ([the kernel by landmarks, by half of them],
+        number of landmarks), drawn by `weights`."""
         kernel, observed = self.representation.kernel, self.observations.representatives
         landmarks = self.representation.landmarks
-        if landmarks is None and len(observed) > MOST_EXACT:
+        if landmarks is None and len(observed) > MOST_WITHOUT_LANDMARKS:
             landmarks = DEFAULT_LANDMARKS
         if not landmarks or landmarks >= len(observed):
             return [Exact(kernel, observed)], None
@@ -528,7 +530,7 @@ class IdealisedLearner:
         return (Landmarks(kernel, observed, some) for some in parts), landmarks  # one at a time
 
     def conventions(self, settings: Mapping[str, Any], clipped: Mapping[str, float]) -> dict[str, Any]:
-        """Conventions of a regret, JSON-able; settings: of the learner."""
+        """Conventions of a regret, JSON-able. settings: of the learner."""
         return {
             **settings,
             "episode": self.episode,
@@ -596,7 +598,7 @@ def descent(
     """(C, A): what `steps` gradient steps, the largest that do not overshoot, add to values whose error is (C, A).
 
     Args:
-        weights: (C, A), of the squared errors. vector: (C, 1), the last phase's eigenvector; replaced.
+        weights: (C, A), of the squared errors. vector: (C, 1), the last phase's eigenvector, which is replaced.
     """
     largest = apply.largest_eigenvalue(weights.max(axis=1, keepdims=True), vector)
     before = float((weights * error**2).sum())
@@ -633,7 +635,7 @@ class Memory:
         return float((visits.executed[self.states] * self.rewards).sum()), length
 
     def targets(self, v: np.ndarray, gamma: float) -> tuple[np.ndarray, np.ndarray]:
-        """((N, A), (N, A)): the mean target of each choice, by the values v (N,) of states; and its visits."""
+        """((N, A), (N, A)): the mean target of each choice, by the values v (N,) of states, and its visits."""
         chance, x = self.mdp.chance.at(self.states), np.zeros(self.mdp.num_states + 1)
         x[self.states] = v
         q = self.rewards + gamma * self.mdp.dynamics.expected(x, self.states)
@@ -652,7 +654,7 @@ class Memory:
 
 
 class ExpectedVisits(NamedTuple):
-    """Expected visits in an episode: first (S,), of the first step; later (S, W), by the previously executed action;
+    """Expected visits in an episode: first (S,), of the first step, later (S, W), by the previously executed action:
     executed (S, A), of all steps by what is executed."""
 
     first: np.ndarray

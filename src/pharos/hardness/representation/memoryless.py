@@ -23,7 +23,7 @@ LOSS_WIDTH = 1e-7
 # Improvements of one policy, and steps of its occupancy
 MOST_MEMORYLESS_IMPROVEMENTS, MOST_STEPS = 20, 400
 # States times actions of relaxed problems: larger ones get one bound from above, the optimum
-MOST_ENTRIES = 2_000_000
+MOST_PAIRS = 2_000_000
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class MemorylessLoss:
     """Optimal value minus the value of the best deterministic memoryless policy on an observation, at the start.
 
     Attributes:
-        lower, upper: bounds of the loss, proven; in units of return.
+        lower, upper: proven bounds of the loss, in units of return.
         exact: whether they differ by rounding and tolerance alone.
         policies: how many policies, and relaxed problems, were solved.
     """
@@ -50,7 +50,7 @@ def memoryless_loss(
     If some actions are not available, policies take what is available in all states that look alike.
 
     Args:
-        mdp: discounted or with a horizon, as `value_iteration` takes it; random actions, but no sticky ones.
+        mdp: discounted or with a horizon, as `value_iteration` takes it, with random actions, but no sticky ones.
         classes: (S,) the number of the observation of each state, as `observation_classes` gives it.
         optimal: the solution of `mdp`, if there is one.
         budget: seconds after which the bounds so far are returned.
@@ -86,7 +86,7 @@ class _PolicySearch:
         self.classes = classes
         self.count = int(classes.max()) + 1
         self.is_shared = np.bincount(classes[self.live], minlength=self.count) > 1
-        self.is_small = mdp.num_states * mdp.num_actions <= MOST_ENTRIES
+        self.is_small = mdp.num_states * mdp.num_actions <= MOST_PAIRS
         self.sets = np.ones((self.count, mdp.num_actions), np.bool_)
         if mdp.available is not None:
             np.logical_and.at(self.sets, classes, mdp.available)
@@ -153,10 +153,10 @@ class _PolicySearch:
         return mixed, (weights * rewards[owner]).sum(axis=1).reshape(rewards.shape)
 
     def rounded(self, solution: Solution, fixed: np.ndarray) -> tuple[float, int]:
-        """(value at the start of a memoryless policy near the solution; the observation to branch on, -1: none).
+        """(value at the start of a memoryless policy near the solution, the observation to branch on or -1 for none).
 
         The policy takes in each observation the action with the largest value over its states, weighted by how much an
-        optimal one is there; it is then improved by its own values and visits.
+        optimal one is there. It is then improved by its own values and visits.
         """
         policy = np.asarray(solution.q).argmax(axis=1)
         visits = self.visits(policy)
@@ -179,12 +179,12 @@ class _PolicySearch:
         return value, conflict
 
     def best(self, q: np.ndarray, weights: np.ndarray, fixed: np.ndarray) -> np.ndarray:
-        """(C,): for each observation the action with the largest weighted value; a fixed one as it is."""
+        """(C,): for each observation the action with the largest weighted value. Fixed actions stay."""
         actions = np.where(self.sets, self.sums(np.asarray(q), weights), -np.inf).argmax(axis=1)
         return np.where(fixed < 0, actions, fixed)
 
     def lost(self, q: np.ndarray, weights: np.ndarray, actions: np.ndarray, fixed: np.ndarray) -> np.ndarray:
-        """(C,): the weighted value that each observation loses by its one action; 0 if it has a fixed one."""
+        """(C,): the weighted value that each observation loses by its one action, 0 if the action is fixed."""
         q = np.asarray(q)
         gaps = q.max(axis=1) - q[np.arange(len(q)), actions[self.classes]]
         lost = np.bincount(self.classes, np.where(self.live, weights * gaps, 0.0), minlength=self.count)
@@ -198,7 +198,7 @@ class _PolicySearch:
         return np.stack(list(columns), axis=1)
 
     def visits(self, policy: np.ndarray) -> np.ndarray:
-        """(S,): how often a policy is in each state, discounted; its first steps."""
+        """(S,): how often a policy is in each state after its first steps, discounted."""
         mdp = self.mdp
         mass = np.zeros(mdp.num_states)
         mass[mdp.start_states] = mdp.start_probabilities

@@ -7,7 +7,7 @@
     cnn16-64x3  the same with three of 64
     nature      the three convolutions of Mnih et al. (2015), then two of 128: images from 36 pixels on
 
-All units are ReLUs; "+tanh" behind the name makes hyperbolic tangents of the hidden layers after the first, as the
+All units are ReLUs. "+tanh" behind the name makes hyperbolic tangents of the hidden layers after the first, as the
 policies of PPO and A2C have in Stable-Baselines3.
 
 The neural tangent kernel of a network in closed form:
@@ -21,8 +21,8 @@ of a weight and a bias of the next layer,
 
     q' = v n E[f(u) f(u')] + b,    T' = n E[f(u) f(u')] + 1 + v n E[f'(u) f'(u')] T,    (u, u') centred Gaussian of q
 
-exact for wide layers; the number of units stays in it. After a convolution a position of one picture meets the same
-position of the other alone, as each position has weights of its own after flattening (Arora et al., 2019).
+exact for wide layers, in which the number of units still counts. After a convolution a position of one picture meets
+the same position of the other alone, as each position has weights of its own after flattening (Arora et al., 2019).
 """
 
 import itertools
@@ -61,16 +61,16 @@ _NATURE = (Convolution(32, 8, 4), Convolution(64, 4, 2), Convolution(64, 3))
 
 @dataclass(frozen=True)
 class Network:
-    """Convolutions, hidden layers and a linear output; see the top of the file for names.
+    """Convolutions, hidden layers and a linear output. The top of the file explains names.
 
     Attributes:
         name: as `Network.of` reads it.
-        convolutions: with ReLUs; their output is flattened. None of them: observations are flattened.
+        convolutions: with ReLUs. Their output is flattened. Without any, observations are flattened.
         hidden: units of each hidden layer.
-        tanh: whether hidden layers after the first have hyperbolic tangents; the first always has ReLUs.
-        initialisation: "pytorch", its default: weights and biases uniform in +-1 / sqrt(fan-in), so of variance
-            1 / (3 fan-in); that is what DQN has. "sb3", of actor-critics in Stable-Baselines3: orthogonal weights with
-            gain sqrt(2), of the output 1 (of the value; policies have 0.01), biases 0.
+        tanh: whether hidden layers after the first have hyperbolic tangents. The first always has ReLUs.
+        initialisation: "pytorch", its default: weights and biases uniform in +-1 / sqrt(fan-in), so of variance 1 / (3
+            fan-in), as DQN has. "sb3", of actor-critics in Stable-Baselines3: orthogonal weights with gain sqrt(2), of
+            the output 1 (of the value; policies have 0.01), biases 0.
     """
 
     name: str
@@ -127,7 +127,7 @@ def is_channels_last(shape: Sequence[int]) -> bool:
 
 
 def _layers(text: str) -> tuple[int, ...] | None:
-    """`128x2-64` -> (128, 128, 64); None if it is not of that form."""
+    """`128x2-64` -> (128, 128, 64), or None if it is not of that form."""
     layers: list[int] = []
     for part in text.split("-") if text else ():
         match = re.fullmatch(r"([1-9]\d*)(?:x([1-9]\d?))?", part)
@@ -147,7 +147,7 @@ def check_memory(rows: int, columns: int, what: str) -> None:
     """Refuse a kernel that would not fit.
 
     Raises:
-        ParameterError: it takes more than half of what is free; the size that fits, and what to do, are said.
+        ParameterError: it takes more than half of what is free. The message says which size fits, and what to do.
     """
     from pharos.system.memory import available_memory
 
@@ -317,7 +317,8 @@ def _patches(images: np.ndarray, layer: Convolution) -> "Sequence[np.ndarray]":
 
 
 def _windows(before: tuple[int, ...], after: tuple[int, ...], layer: Convolution) -> np.ndarray:
-    """(positions, window): indices of the positions before a convolution that each one after it sees; -1: padding."""
+    """(positions, window): indices of the positions before a convolution that each one after it sees, -1 for
+    padding."""
     offsets = np.arange(layer.size)
     rows, columns = (layer.stride * np.arange(n)[:, None] - layer.padding + offsets for n in after)
     is_inside = [(index >= 0) & (index < n) for index, n in zip((rows, columns), before, strict=True)]
@@ -344,7 +345,7 @@ class _Head:
         self.y = self.x if of_y is of_x else self._variances(of_y)
 
     def _variances(self, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(L, N) of pre-activations; (L, N, M) Hermite coefficients, M = 0 if all units are ReLUs."""
+        """(L, N) of pre-activations, and (L, N, M) Hermite coefficients, M = 0 if all units are ReLUs."""
         variances, coefficients = [variance], []
         for layer, kind in enumerate(self.kinds):
             if kind:  # an observation of zeros has slope 1 here; a ReLU, as in PyTorch, none
@@ -366,7 +367,8 @@ class _Head:
 
 
 def _tanh_coefficients(variances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """((N, TERMS) Hermite coefficients of degree 1, 3, ... of tanh(s z), z standard normal; (N,) E[tanh(s z)^2])."""
+    """((N, TERMS) Hermite coefficients of degree 1, 3, ... of tanh(s z), z standard normal, and (N,) E[tanh(s
+    z)^2])."""
     z, weights = np.polynomial.hermite_e.hermegauss(NODES)
     weights = weights / weights.sum()
     polynomials = np.empty((2 * TERMS, NODES))  # normalised: h_n+1 = (z h_n - sqrt(n) h_n-1) / sqrt(n + 1)

@@ -40,8 +40,8 @@ class Sampling:
         walks: independent ones, of which the mean is taken.
         batch_size: transitions of a gradient step.
         buffer_size: transitions that are remembered.
-        reward_noise: standard deviation of normal noise on what is paid; the regret is of what is earned.
-        seed: of the first walk; the others have the next ones.
+        reward_noise: standard deviation of normal noise on what is paid. The regret is of what is earned.
+        seed: of the first walk. The others have the next ones.
     """
 
     walks: int = 3
@@ -72,7 +72,7 @@ class SampledCurve:
 
     @property
     def walks(self) -> np.ndarray:
-        """(walks,) the mean over evaluations of each; a policy counts at most WORST_GREEDY."""
+        """(walks,) the mean over evaluations of each. A policy counts at most WORST_GREEDY."""
         return np.minimum(self.greedy, WORST_GREEDY).mean(axis=1)
 
     @property
@@ -82,7 +82,7 @@ class SampledCurve:
 
     @property
     def deviation(self) -> float:
-        """Standard deviation of one walk; NaN of a single one."""
+        """Standard deviation of one walk, or NaN if there is a single one."""
         return float(self.walks.std(ddof=1)) if len(self.greedy) > 1 else math.nan
 
     def to_dict(self) -> dict[str, Any]:
@@ -97,9 +97,9 @@ class SampledRegret:
     Attributes:
         descent: gradients as they are. adam: gradients rescaled as by full-matrix Adam if all observations are
             equally frequent. tabular: with the identity in the place of the kernel, on the states themselves.
-        observations: different ones that it learns from; states: that can be met and are not terminal.
-        landmarks: of the approximation; None: the kernel is exact.
-        estimated_error: half of the landmarks change the value by that much: an estimate, not a bound; 0 if exact.
+        observations: different ones that it learns from. states: that can be met and are not terminal.
+        landmarks: of the approximation. None: the kernel is exact.
+        estimated_error: half of the landmarks change the value by that much: an estimate, not a bound. 0 if exact.
         conventions: schedule, sampling, episode, observation and network.
     """
 
@@ -119,7 +119,7 @@ class SampledRegret:
 
     @property
     def deviation(self) -> float:
-        """Standard deviation of a walk's value, both forms from the same seed; NaN of a single walk."""
+        """Standard deviation of a walk's value, both forms from the same seed. NaN of a single walk."""
         values = (self.descent.walks + self.adam.walks) / 2
         return float(values.std(ddof=1)) if len(values) > 1 else math.nan
 
@@ -138,7 +138,7 @@ class SampledRegret:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able; without the deviation if there is a single walk."""
+        """JSON-able. Without the deviation if there is a single walk."""
         deviation = {} if math.isnan(self.deviation) else {"deviation": self.deviation}
         return {
             "value": self.value,
@@ -187,22 +187,22 @@ def sampled_regret(
     full-matrix Adam makes of K if all observations are equally frequent.
 
     Args:
-        representation: the kernel; see `pharos.observations.representation`.
-        schedule: None: the default of `Schedule`; its optimizer does not count, as both forms are computed.
+        representation: the kernel, see `pharos.observations.representation`.
+        schedule: Default: the default of `Schedule`. Its optimizer does not count, as both forms are computed.
         sampling: None: the default of `Sampling`.
         solution: the optimal values of `mdp`, if they are known.
-        horizon: steps of an episode that the learner sees; None: the MDP's, else the time limit.
-        progress: called with a line now and then; an exception of its own ends the computation.
+        horizon: steps of an episode that the learner sees. Default: the MDP's, else the time limit.
+        progress: called with a line now and then. An exception that it raises ends the computation.
     Returns:
         A SampledRegret. With the identity for a kernel it is tabular Q-learning with a replay memory. Rewards belong to
         drawn outcomes if the MDP is of an environment, else they are expected ones. The same seed gives the same
         number.
     Raises:
-        UndefinedMeasure: there is neither a horizon nor a time limit; or uniform play is optimal.
+        UndefinedMeasure: there is neither a horizon nor a time limit, or uniform play is optimal.
         ParameterError: the representation is of other states, or its kernel does not fit into memory.
-    Cost: a walk takes O(steps |B| C / 4) for C different observations, and 31 values; C^3 once for the root of K.
+    Cost: a walk takes O(steps |B| C / 4) for C different observations, and 31 values, and C^3 once for the root of K.
         Beyond MOST_EXACT observations landmarks, whose walks take no longer for more of them. 24 bytes a step.
-    Source: pharos; Mnih et al. (2015) for what is drawn.
+    Source: pharos, with what is drawn as in Mnih et al. (2015).
     """
     learner = SampledLearner(mdp, representation, schedule, horizon, solution, progress)
     learner.sampling = sampling = sampling or Sampling()
@@ -233,7 +233,8 @@ class SampledLearner(IdealisedLearner):
 
     @cached_property
     def outcomes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """(offsets of the outcomes of each pair; next states, -1 for the end; rewards; cumulative probabilities)."""
+        """(offsets of the outcomes of each pair, next states with -1 for the end, rewards, cumulative
+        probabilities)."""
         pairs = self.whole.num_states * self.whole.num_actions
         which, states, rewards, probabilities = paid_outcomes(self.whole)
         offsets = np.searchsorted(which, np.arange(pairs + 1))

@@ -2,7 +2,7 @@
 LaTeX.
 
 results.py    the data of a report, read and computed once: `Results`
-sections.py   the content of each section; empty ones are left out
+sections.py   the content of each section, without empty ones
 page.py       the HTML page, by the templates beside it
 files.py      the tables, and `report`, which writes it all
 """

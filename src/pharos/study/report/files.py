@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from pharos.plots import save_for_page
 from pharos.study.figures import all_curves, all_figures, tables_of
 from pharos.study.prediction_figures import unseen_figures
-from pharos.study.report.model_sections import doubts, judged, unseen_section
+from pharos.study.report.model_sections import doubts, judged_cells, unseen_section
 from pharos.study.report.page import render_page
 from pharos.study.report.results import Results, coefficients, study_results
 from pharos.study.report.sections import sections_of
@@ -55,16 +55,16 @@ def report(
 
     Args:
         source: YAML file, preset, mapping, Specification, the folder of a study, or the name of one in `studies`.
-        folder: of the results; None for that folder, or studies/NAME.
-        out: folder to write to; None for `report` in the folder of the study.
+        folder: of the results. Default: that folder, or studies/NAME.
+        out: folder to write to. Default: `report` in the folder of the study.
         progress: called with what is being done.
-        trust: whether code that the study names may be imported; as for `specification`.
-        predictions: of `read_predictions`, or several of them, of different cells; figures, a section and a table say
+        trust: whether code that the study names may be imported, as for `specification`.
+        predictions: of `read_predictions`, or several of them, of different cells. Figures, a section and a table say
             what came true of them, and how many runs had begun before they were written.
     Raises:
-        ParameterError: no run is finished; or none of those that were predicted, or of fewer than three classes; or a
-            cell was predicted twice.
-    Cost: the measures of hardness of what has finished runs, once, each at most its budget; then seconds.
+        ParameterError: no run is finished. Or none of the predicted runs is, or these have fewer than three classes, or
+            a cell was predicted twice.
+    Cost: the measures of hardness of what has finished runs, once, each at most its budget, then seconds.
     """
     from pharos.study.predictions import PredictedCells
 
@@ -86,7 +86,7 @@ def report(
             images["curves"] = curves[name].to_json().encode()
     # Predictors on classes left out, with their figures and tables
     report_progress("leaving out classes")
-    judgement, outcomes = judged(results, predicted)
+    judgement, outcomes = judged_cells(results, predicted)
     more = {"outcomes": outcomes}
     if predicted is not None:
         more["predicted"] = predicted.cells
@@ -132,7 +132,7 @@ def _write_tables(folder: Path, results: Results, more: "Mapping[str, pd.DataFra
 
 
 def spreadsheet_safe(data: "pd.DataFrame") -> "pd.DataFrame":
-    """The same table, in which no text begins as a formula of a spreadsheet does; numbers stay numbers."""
+    """The same table, in which no text begins as a formula of a spreadsheet does. Numbers stay numbers."""
     safe = data.rename(columns=_no_formula)
     for name in safe.columns:
         if safe[name].dtype.kind not in "fiub":

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def models_section(results: Results, figures: Figures, left_out: list[str]) -> Section | None:
-    """The models of regret by hardness; None if there are none: `left_out` says why."""
+    """The models of regret by hardness. None if there are none: `left_out` says why."""
     if not results.agents:
         left_out.append("Hardness and regret: tabular agents, which see the state itself, have no models.")
         return None
@@ -94,7 +94,7 @@ def _predictor(name: str) -> str:
 
 
 def agreement_section(results: Results, figures: Figures, left_out: list[str]) -> Section | None:
-    """The correlation of agents over cells; None if too few are common: `left_out` says so."""
+    """The correlation of agents over cells. None if too few are common: `left_out` says so."""
     lines, images = [], []
     for i, one in enumerate(results.agents):
         for two in results.agents[i + 1 :]:
@@ -128,8 +128,8 @@ def agreement_section(results: Results, figures: Figures, left_out: list[str]) -
 FEW_PERMUTATIONS = 499
 
 
-def judged(results: Results, predictions: "PredictedCells | None") -> "tuple[pd.DataFrame | None, pd.DataFrame]":
-    """(statistics of predictors, or None if there are fewer than two classes; cells with outcomes).
+def judged_cells(results: Results, predictions: "PredictedCells | None") -> "tuple[pd.DataFrame | None, pd.DataFrame]":
+    """(statistics of predictors, or None if there are fewer than two classes, cells with outcomes).
 
     Raises:
         ParameterError: there are predictions, but of other cells, or of fewer than three classes.
@@ -200,7 +200,7 @@ def winners(judgement: "pd.DataFrame") -> list[str]:
 
 
 def _provenance(results: Results, predictions: "PredictedCells | None") -> list[str]:
-    """Date, version and hash of files of predictions, and whether they were written before the runs; a line each."""
+    """Date, version and hash of files of predictions, and whether they were written before the runs, a line each."""
     if predictions is None:
         return ["Without predictions (pharos study predict), of tabular measures alone."]
     lines = [
@@ -300,7 +300,7 @@ def _mixed(rows: "pd.DataFrame") -> ReportTable | None:
 
 
 def _of_predictors(rows: "pd.DataFrame", columns: Mapping[str, Any], caption: str) -> ReportTable | None:
-    """A row for each predictor; None if there is none."""
+    """A row for each predictor, or None if there is none."""
     import pandas as pd
 
     if not len(rows):

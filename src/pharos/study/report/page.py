@@ -59,7 +59,7 @@ class ReportTable:
 
 @dataclass(frozen=True)
 class Image:
-    """A figure for light and for dark pages, as data URLs; its name is the name of its file.
+    """A figure for light and for dark pages, as data URLs. Its name is the name of its file.
 
     `curves` has the numbers of its lines, as JSON: the page draws them anew, to be pointed at. Empty for other figures.
     """
@@ -82,7 +82,7 @@ def render_page(title: str, description: str, sections: Sequence[Section]) -> st
 
 
 def figure_image(figures: Figures, name: str, caption: str) -> Image | None:
-    """A figure with its caption; None if it was not drawn."""
+    """A figure with its caption, or None if it was not drawn."""
     images = figures.get(name)
     if not images:
         return None
@@ -96,7 +96,7 @@ def data_url(png: bytes) -> str:
 
 
 def data_table(data: "pd.DataFrame", caption: str = "", *, digits: int = 3) -> ReportTable:
-    """A frame as a table: numbers short and to the right, whole ones without digits; empty columns are left out."""
+    """A frame as a table: numbers short and to the right, whole ones without digits. Empty columns are left out."""
     data = data[[name for name in data.columns if len(data) == 0 or not (data[name] == "").all()]]
     columns, digits_of = [], []
     for name in data.columns:

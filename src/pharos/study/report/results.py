@@ -31,13 +31,13 @@ class Results:
         hardness: a row for each instance and kind of chance that has finished runs.
         aliasing: a row for each instance and observation that was counted.
         cells: means over seeds, with hardness.
-        models: of each agent that sees observations, for both kinds of regret; the first agent's first.
+        models: of each agent that sees observations, for both kinds of regret, the first agent's first.
         intervals: of the normalised regret of each class, agent and observation.
         profiles, improvements: performance profiles of agents and observations, and how probable one improves on
             another.
         differences: in normalised regret, of each two agents or observations over all classes.
         other_winners: tasks on which the highest return and the least regret belong to different agents.
-        comparison, findings: beside the paper; None if the study is not the paper's.
+        comparison, findings: beside the paper. None if the study is not the paper's.
     """
 
     study: Specification
@@ -59,7 +59,7 @@ class Results:
 
     @property
     def agents(self) -> list[str]:
-        """Agents that see observations, DQN first; those that see the index of the state have no models."""
+        """Agents that see observations, DQN first. Agents that see the index of the state have no models."""
         return observing_agents(self.runs)
 
     @cached_property

@@ -1,4 +1,4 @@
-"""Contents of the sections of the page; None for an empty one. Texts only: the templates make HTML of them."""
+"""Contents of the sections of the page, None for an empty one. Texts only: the templates make HTML of them."""
 
 import io
 import platform
@@ -149,7 +149,7 @@ def _other_winners(results: Results) -> list[str]:
 
 
 def _estimated(runs: "pd.DataFrame") -> str | None:
-    """Sentences on the regret that is estimated, and how wrong it may be; None if all regret is exact."""
+    """Sentences on the regret that is estimated, and how wrong it may be. None if all regret is exact."""
     estimates = runs[~runs["exact"].astype(bool)]
     if len(estimates) == 0:
         return None
@@ -213,13 +213,13 @@ def _regret(results: Results, figures: Figures) -> Section:
 
 
 def _intervals(rows: "pd.DataFrame", digits: int) -> list[str]:
-    """Texts of the columns `lower` and `upper`; n/a if there is no interval."""
+    """Texts of the columns `lower` and `upper`, n/a if there is no interval."""
     ends = zip(rows["lower"], rows["upper"], strict=True)
     return [f"{low:.{digits}f} to {high:.{digits}f}" if np.isfinite(low) else "n/a" for low, high in ends]
 
 
 def _profiles(results: Results, figures: Figures) -> Section | None:
-    """Profiles and improvements; None if there is but one agent and observation."""
+    """Profiles and improvements. None if there is but one agent and observation."""
     if len(results.improvements) == 0:
         return None
     shown = results.improvements.assign(interval=_intervals(results.improvements, 2)).drop(columns=["lower", "upper"])
@@ -341,7 +341,7 @@ def _return(row: Mapping[str, Any]) -> str:
 
 
 def _paper_comparison(results: Results) -> Section | None:
-    """Our numbers beside the paper's; None if no number is in both."""
+    """Our numbers beside the paper's. None if no number is in both."""
     if results.comparison is None:
         return None
     ours = [name for name in results.comparison.regressions.columns if name.startswith("ours_")]
@@ -375,7 +375,7 @@ def _instances(study: Specification) -> Section | None:
 
 
 def _pictures(study: Specification) -> dict[str, bytes]:
-    """Instance -> PNG of its start state; environments that draw nothing are left out."""
+    """Instance -> PNG of its start state. Environments that draw nothing are left out."""
     from PIL import Image
 
     from pharos.drawing import human
