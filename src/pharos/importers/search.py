@@ -11,17 +11,13 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from pharos.errors import RuleError, StateSpaceTooLarge
 from pharos.importers.folder import ImportedOutcomes
 from pharos.mdp import Residual, Rewards, TabularMDP, lacking, normalized_rows, rounding_of_mean
-
-if TYPE_CHECKING:
-    from pharos.importers.side_effects import SideEffects
-    from pharos.importers.step_spaces import SpaceRecorder
 
 END = -1
 REPORT_SECONDS = 0.1
@@ -58,37 +54,6 @@ class Steppable(Protocol):
 
     def starts(self) -> list[Arrival]:
         """The states in which episodes start, with their probabilities."""
-
-
-class SteppedSource(Steppable, Protocol):
-    """A source that `stepping` imports: an environment of Gymnasium, or functions of JAX.
-
-    Attributes:
-        action_names, time_limit: of the environment. observer: what it shows. effects: what it did to the process.
-    """
-
-    action_names: tuple[str, ...] | None
-    time_limit: int | None
-    observer: "SpaceRecorder"
-    effects: "SideEffects"
-
-    def expansions(self, workers: int) -> "Expansions":
-        """States to be expanded, here or by other processes."""
-
-    def arrive(self, saved: bytes | None, action: int, script: Sequence[int]) -> Arrival:
-        """Repeat an earlier step with these draws, from a saved state or from the reset (None)."""
-
-    def skip(self, keys: Sequence[bytes]) -> None:
-        """Hand over no saved states of these keys, which others have."""
-
-    def integers(self, saved: bytes) -> dict[str, int]:
-        """Whole numbers that a state holds, by the names of their fields."""
-
-    def compare(self, states: "SteppedStates", horizon: int | None) -> None:
-        """RuleError if a new environment, with its own chance, does what the states say to be impossible."""
-
-    def check_rest(self) -> None:
-        """Checks when all states were expanded."""
 
 
 class Expansions(Protocol):

@@ -10,7 +10,7 @@ from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import partial
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from pharos.errors import ParameterError, PharosError, RuleError, UnknownName
 from pharos.importers import side_effects
 from pharos.importers.chance import MOST_DRAW_OUTCOMES, DrawError, DrawTree, line_of_code, placed
 from pharos.importers.fresh_play import FreshPlay
-from pharos.importers.search import Arrival, Expansions, ExpansionsHere, SteppedSource, SteppedStates
+from pharos.importers.search import Arrival, Expansions, ExpansionsHere, Steppable, SteppedStates
 from pharos.importers.side_effects import SideEffects
 from pharos.importers.snapshots import EnvironmentSnapshots, bare, chain_of, field_names, integers_of, snapshot_digest
 from pharos.importers.step_spaces import SpaceRecorder, listed_actions_of
@@ -68,6 +68,37 @@ class SteppingOptions:
 
 class ConstantChanged(Exception):
     """A table that all copies shared was changed by a step, or a counter that was left out matters."""
+
+
+class SteppedSource(Steppable, Protocol):
+    """A source that `stepping` imports: an environment of Gymnasium, or functions of JAX.
+
+    Attributes:
+        action_names, time_limit: of the environment. observer: what it shows. effects: what it did to the process.
+    """
+
+    action_names: tuple[str, ...] | None
+    time_limit: int | None
+    observer: SpaceRecorder
+    effects: SideEffects
+
+    def expansions(self, workers: int) -> Expansions:
+        """States to be expanded, here or by other processes."""
+
+    def arrive(self, saved: bytes | None, action: int, script: Sequence[int]) -> Arrival:
+        """Repeat an earlier step with these draws, from a saved state or from the reset (None)."""
+
+    def skip(self, keys: Sequence[bytes]) -> None:
+        """Hand over no saved states of these keys, which others have."""
+
+    def integers(self, saved: bytes) -> dict[str, int]:
+        """Whole numbers that a state holds, by the names of their fields."""
+
+    def compare(self, states: SteppedStates, horizon: int | None) -> None:
+        """RuleError if a new environment, with its own chance, does what the states say to be impossible."""
+
+    def check_rest(self) -> None:
+        """Checks when all states were expanded."""
 
 
 class SteppedEnvironment:

@@ -14,7 +14,7 @@ import numpy as np
 from pharos.importers import side_effects
 from pharos.importers.chance import MOST_DRAW_OUTCOMES
 from pharos.importers.folder import ImportedOutcomes
-from pharos.importers.search import BreadthFirst, SteppedSource, SteppedStates, mdp_of
+from pharos.importers.search import BreadthFirst, SteppedStates, mdp_of
 from pharos.importers.step_checkpoint import StepCheckpoint
 from pharos.importers.stepped_environment import (
     ClockSearch,
@@ -22,6 +22,7 @@ from pharos.importers.stepped_environment import (
     Factory,
     Payment,
     SteppedEnvironment,
+    SteppedSource,
     SteppingOptions,
 )
 from pharos.importers.wrappers import Stepped
