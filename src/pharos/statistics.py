@@ -217,7 +217,7 @@ def fieller_interval(levels: np.ndarray, strata: Strata, target: float) -> tuple
     variances[variances < ZERO_VARIANCE] = 0.0
     last = len(levels) - 1
 
-    def excess(position: Any, side: int) -> Any:
+    def excess(position: float | np.ndarray, side: int) -> np.ndarray:
         """Upper (side 1) or lower (side -1) limit of the mean less the target. Positions count levels from 0."""
         left = np.minimum(np.asarray(position).astype(int), max(last - 1, 0))
         right = np.minimum(left + 1, last)

@@ -55,6 +55,7 @@ from pharos.training import (
     Shapes,
     Task,
     TaskCache,
+    TrainingProgress,
     Work,
     check_agent_files,
     clear_run,
@@ -248,7 +249,7 @@ class TrainedForm(Form):
         """Train runs of the batched engine and tables, by lanes. They are of pharos' own code."""
         folders, seconds = [job.folder for job in jobs], [job.task.seconds.get(self.label, 1.0) for job in jobs]
 
-        def progress(now: Any) -> None:
+        def progress(now: TrainingProgress) -> None:
             failures = f", {now.failed} failed" if now.failed else ""
             settings.on_progress(now.done / now.total, f"{now.finished} of {len(jobs)} runs{failures}")
 

@@ -14,6 +14,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from pharos.errors import UnknownName
 
@@ -149,7 +150,7 @@ class SmallNetwork:
         return twin
 
 
-def encoded(observations: Any, fault: str) -> np.ndarray:
+def encoded(observations: npt.ArrayLike, fault: str) -> np.ndarray:
     """(N, ...) observations as (N, D) float32, bytes divided by 255."""
     x = np.asarray(observations)
     is_bytes = x.dtype == np.uint8 and fault != "bytes_not_divided"
@@ -170,10 +171,10 @@ class Greedy:
     def __init__(self, network: SmallNetwork, fault: str):
         self.network, self.fault = network.copy(), fault
 
-    def q_values(self, observations: Any) -> np.ndarray:
+    def q_values(self, observations: npt.ArrayLike) -> np.ndarray:
         return self.network(batch_of(encoded(observations, self.fault), self.fault))
 
-    def __call__(self, observations: Any) -> np.ndarray:
+    def __call__(self, observations: npt.ArrayLike) -> np.ndarray:
         q = self.q_values(observations)
         probabilities = np.eye(q.shape[1])[q.argmax(axis=1)]
         if self.fault == "plays_at_random":
@@ -245,10 +246,10 @@ class Stochastic:
     def __init__(self, actor: SmallNetwork, critic: SmallNetwork, fault: str):
         self.actor, self.critic, self.fault = actor.copy(), critic.copy(), fault
 
-    def values(self, observations: Any) -> np.ndarray:
+    def values(self, observations: npt.ArrayLike) -> np.ndarray:
         return self.critic(encoded(observations, self.fault))[:, 0]
 
-    def __call__(self, observations: Any) -> np.ndarray:
+    def __call__(self, observations: npt.ArrayLike) -> np.ndarray:
         probabilities = action_probabilities(self.actor(encoded(observations, self.fault)).astype(np.float64))
         return np.roll(probabilities, self.fault == "action_off_by_one", axis=1)
 

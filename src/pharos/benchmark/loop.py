@@ -307,7 +307,7 @@ class LoopRun:
             self._write("finished", result=result, seconds=seconds)
         return TrainingResult(self.config.to_dict(), result, list(self.rows), None, self.folder, seconds)
 
-    def _write(self, status: str, **entries: Any) -> None:
+    def _write(self, status: str, **entries: object) -> None:
         if self.folder is None:
             return
         self.folder.mkdir(parents=True, exist_ok=True)

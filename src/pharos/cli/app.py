@@ -82,7 +82,7 @@ class _Group(TyperGroup):
                 raise
             return code
 
-    def invoke(self, ctx: Any) -> Any:
+    def invoke(self, ctx: Any) -> object:
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt as error:  # which some releases of Typer answer by an empty line

@@ -510,7 +510,7 @@ class BranchingPythonGenerator(BranchingGenerator):
         values = range(low) if high is None else range(low, high, step)
         return values[self._index(len(values))]
 
-    def choice(self, a: Any, *_: object, **__: object) -> object:
+    def choice(self, a: Sequence[object], *_: object, **__: object) -> object:
         """One of a sequence."""
         return self._one_of([a[i] for i in range(len(a))], None)
 

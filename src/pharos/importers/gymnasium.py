@@ -19,9 +19,10 @@ from typing import Any, Protocol, TypeAlias, runtime_checkable
 import numpy as np
 import numpy.typing as npt
 
-from pharos.errors import FileFormatError, MissingExtra, ParameterError, RuleError, StateSpaceTooLarge
+from pharos.errors import FileFormatError, MissingExtra, ParameterError, RuleError
 from pharos.importers.files import MINIGRID_STEPS
 from pharos.importers.folder import ImportedOutcomes
+from pharos.importers.search import Arrival, BreadthFirst, ExpansionsHere
 from pharos.importers.wrappers import Layers, as_integer, check_wrappers, first_number, reset, step_parts
 from pharos.mdp import Names, Residual, Rewards, TabularMDP, normalized_rows, rounding_of_mean
 from pharos.system.wording import capped
@@ -590,13 +591,10 @@ def minigrid(
         RuleError: a step draws random numbers, or touches what cannot be kept; or the payment, or the outcome, of a
             class of one's own depends on the number of steps in another way than the package's.
         StateSpaceTooLarge: there are more than `max_states` states.
-    Cost: 0.1 to 1 ms a transition, by the size of the grid; 1 to 20 kB a state while it runs.
+    Cost: 0.1 to 1 ms a transition, by the size of the grid; 1 to 20 kB a state of the frontier.
     """
-    driver = _Driver(env, seed, remember_carried)
-    table, rewards = driver.explore(actions, max_states)
-    names = [action.name for action in driver.env.actions]
-    names = names[: table.shape[1]] if actions is None else [names[action] for action in actions]
-    return TabularMDP.from_arrays(table, rewards, gamma=gamma, horizon=horizon).with_names(actions=names)
+    driver = _Driver(env, seed, remember_carried, actions)
+    return driver.explore(max_states, gamma=gamma, horizon=horizon)[0]
 
 
 def minigrid_recording(
@@ -610,12 +608,9 @@ def minigrid_recording(
         condition), with the agent where it stands, its direction as condition: the image of MiniGrid's FullyObsWrapper.
         What is carried is not to be seen.
     """
-    driver = _Driver(env, seed, remember_carried)
-    table, rewards = driver.explore(None, MOST_MINIGRID_STATES)
-    names = tuple(action.name for action in driver.env.actions)[: table.shape[1]]
-    grids = np.stack([driver.image(state) for state in driver.snapshots])
-    mdp = TabularMDP.from_arrays(table, rewards, gamma=1.0, horizon=horizon)
-    return mdp.with_names(actions=names), grids, names
+    driver = _Driver(env, seed, remember_carried, is_shown=True)
+    mdp, grids = driver.explore(MOST_MINIGRID_STATES, horizon=horizon)
+    return mdp, grids, driver.action_names[: mdp.num_actions]
 
 
 def minigrid_grids(
@@ -630,15 +625,25 @@ def minigrid_grids(
 
     Args, errors and cost: as of `minigrid`.
     """
-    driver = _Driver(env, seed, remember_carried)
-    driver.explore(actions, max_states)
-    return np.stack([driver.image(state) for state in driver.snapshots])
+    return _Driver(env, seed, remember_carried, actions, is_shown=True).explore(max_states)[1]
 
 
 class _Driver:
-    """An environment of MiniGrid that can be restored to any state it has visited."""
+    """An environment of MiniGrid that can be restored to any state it has visited: a source of states for `search`.
 
-    def __init__(self, env: Any, seed: int, remember_carried: bool):
+    Args:
+        selection: its actions; None: all. is_shown: whether the grid of each state is wanted.
+    """
+
+    def __init__(
+        self,
+        env: Any,
+        seed: int,
+        remember_carried: bool,
+        selection: Sequence[int] | None = None,
+        *,
+        is_shown: bool = False,
+    ):
         try:
             import minigrid as package  # registers its environments
             from minigrid.core.world_object import Wall
@@ -658,6 +663,15 @@ class _Driver:
         if not isinstance(self.env, MiniGridEnv):
             raise ParameterError(f"{name_of(env)}: is no environment of MiniGrid {package.__version__}")
         self.name = name_of(env)
+        self.is_shown, self._state, self._sent = is_shown, -1, set[bytes]()
+        space: Any = self.env.action_space
+        names, count = [action.name for action in self.env.actions], int(space.n)
+        self.drops_done = selection is None and count == NO_OP + 1  # if it does nothing in any state
+        self.actions = list(range(count)) if selection is None else [int(action) for action in selection]
+        if not self.actions or not set(self.actions) <= set(range(count)) or len(set(self.actions)) < len(self.actions):
+            raise ParameterError(f"actions are {self.actions}; expected different ones from 0 to {count - 1}")
+        self.num_actions = len(self.actions)
+        self.action_names = tuple(names[action] for action in self.actions)
         self.wall = Wall
         self.remember_carried = remember_carried
         self.fixed_types = (gymnasium.spaces.Space, np.random.Generator, FunctionType)
@@ -667,68 +681,62 @@ class _Driver:
         self.layers.reset(seed)
         if not self.layers.suspects:  # partial views cost most of a step, and nothing else looks at them
             vars(self.env)["gen_obs"] = dict
-        self.snapshots: list[bytes] = []
 
-    def explore(self, selection: Sequence[int] | None, max_states: int) -> tuple[np.ndarray, np.ndarray]:
-        """(next states (S, A), rewards (S, A)), breadth first."""
-        num_actions = int(self.env.action_space.n)
-        actions = list(range(num_actions)) if selection is None else [int(action) for action in selection]
-        if not actions or not set(actions) <= set(range(num_actions)) or len(set(actions)) < len(actions):
-            raise ParameterError(f"actions are {actions}; expected different ones from 0 to {num_actions - 1}")
+    def explore(
+        self, max_states: int, *, gamma: float = 1.0, horizon: int | None = None
+    ) -> tuple[TabularMDP, np.ndarray]:
+        """(the MDP, the grid of each state if it is wanted)."""
+        text = f"{self.name}: has more than max_states={max_states}; raise it or choose a smaller one"
+        search = BreadthFirst(self, max_states=max_states, too_large=lambda _: text)
         try:
-            return self._explore(actions, max_states, drop_done=selection is None and num_actions == NO_OP + 1)
+            states, frontier = search.begin()
+            search.run(states, frontier, ExpansionsHere(self.expanded))
         finally:
             vars(self.env).pop("gen_obs", None)
+        outcomes = states.outcomes()
+        table, rewards = (each.reshape(states.num_states, -1) for each in (outcomes.next_states, outcomes.rewards))
+        names = self.action_names
+        if self.drops_done and (table[:, NO_OP] == np.arange(len(table))).all() and (rewards[:, NO_OP] == 0).all():
+            table, rewards, names = table[:, :NO_OP], rewards[:, :NO_OP], names[:NO_OP]
+        mdp = TabularMDP.from_arrays(table, rewards, gamma=gamma, horizon=horizon).with_names(actions=list(names))
+        return mdp, np.array([each for each in states.observations if each is not None])
 
-    def _explore(self, actions: list[int], max_states: int, drop_done: bool) -> tuple[np.ndarray, np.ndarray]:
-        snapshot = self.save()
-        numbers = {self.key(): 0}
-        self.snapshots = [snapshot]
-        rows: list[list[int]] = []
-        reward_rows: list[list[float]] = []
-        # Breadth first: every action in the next state without a row; unknown states join the end of the queue
-        while len(rows) < len(self.snapshots):
-            row, pay = [], []
-            for action in actions:
-                self.restore(self.snapshots[len(rows)])
-                reward, ended = self.step(action, len(rows))
-                pay.append(reward)
-                if ended:
-                    row.append(-1)
-                    continue
-                key = self.key()
-                number = numbers.setdefault(key, len(numbers))
-                if number == len(self.snapshots):
-                    if number >= max_states:
-                        raise StateSpaceTooLarge(
-                            f"{self.name}: has more than max_states={max_states}; raise it or choose a smaller one"
-                        )
-                    self.snapshots.append(self.save())
-                row.append(number)
-            rows.append(row)
-            reward_rows.append(pay)
-        # Without the action `done` if it does nothing in any state
-        table, rewards = np.array(rows, np.int64), np.array(reward_rows)
-        if drop_done and (table[:, NO_OP] == np.arange(len(table))).all() and (rewards[:, NO_OP] == 0).all():
-            table, rewards = table[:, :NO_OP], rewards[:, :NO_OP]
-        return table, rewards
+    def starts(self) -> list[Arrival]:
+        """The state after the reset."""
+        return [self._arrival(0.0, False)]
 
-    def step(self, action: int, state: int) -> tuple[float, bool]:
+    def expanded(self, states: Sequence[bytes]) -> list[list[list[Arrival]]]:
+        """The outcome of each action in each of some saved states."""
+        rows = []
+        for saved in states:
+            self._state += 1
+            rows.append([[self._arrival(*self.step(action, saved))] for action in self.actions])
+        return rows
+
+    def _arrival(self, reward: float, ended: bool) -> Arrival:
+        key = None if ended else self.key()
+        if key is None or key in self._sent:
+            return Arrival(1.0, reward, key)
+        self._sent.add(key)
+        return Arrival(1.0, reward, key, self.save(), self.image() if self.is_shown else None)
+
+    def step(self, action: int, saved: bytes) -> tuple[float, bool]:
         """(reward without its discount by time, whether the episode ends)."""
+        self.restore(saved)
         late = None
         if not self._is_paid_by_package:
             steps = max(int(self.env.max_steps) - 2, 1)
-            late = (*self._stepped(action, state, steps), self.key())
-            self.restore(self.snapshots[state])
-        payment, terminated = self._stepped(action, state, 0)
+            late = (*self._stepped(action, steps), self.key())
+            self.restore(saved)
+        payment, terminated = self._stepped(action, 0)
         if late is not None and late != (payment, terminated, self.key()):
             if late[0] != payment:
                 what = f"pays {payment:g} at first and {late[0]:g} after {steps:,} steps"
             else:
                 what = f"leads elsewhere after {steps:,} steps than at first"
             raise RuleError(
-                f"{self.name}: {what} by action {action} in state {state}; expected what does not depend on the number "
-                f"of steps, or the package's own payment of 1 - 0.9 steps / max_steps"
+                f"{self.name}: {what} by action {action} in state {self._state}; expected what does not depend on the "
+                f"number of steps, or the package's own payment of 1 - 0.9 steps / max_steps"
             )
         return payment, terminated
 
@@ -739,7 +747,7 @@ class _Driver:
         is_bare = self.layers.top is self.layers.bottom
         return is_bare and all(str(getattr(each, "__module__", "")).startswith("minigrid.") for each in functions)
 
-    def _stepped(self, action: int, state: int, steps: int) -> tuple[float, bool]:
+    def _stepped(self, action: int, steps: int) -> tuple[float, bool]:
         """`step` after so many others; payments equal to the package's are 1."""
         rng = self.env.np_random
         before = rng.bit_generator.state
@@ -749,11 +757,13 @@ class _Driver:
             self.env.carrying.has_been_carried = True
         if rng.bit_generator.state != before:
             raise RuleError(
-                f"{self.name}: draws random numbers in state {state} by action {action}; "
+                f"{self.name}: draws random numbers in state {self._state} by action {action}; "
                 f"expected one outcome of each action"
             )
         if not np.isfinite(reward):
-            raise RuleError(f"{self.name}: pays {reward} in state {state} by action {action}; expected a finite number")
+            raise RuleError(
+                f"{self.name}: pays {reward} in state {self._state} by action {action}; expected a finite number"
+            )
         own = 1 - 0.9 * ((steps + 1) / self.env.max_steps)
         return (1.0 if abs(reward - own) <= 1e-12 else float(reward)), bool(terminated)
 
@@ -787,11 +797,10 @@ class _Driver:
         self.fixed.append(value)
         return len(self.fixed) - 1
 
-    def image(self, snapshot: bytes) -> np.ndarray:
+    def image(self) -> np.ndarray:
         """(width, height, 3), the grid with the agent in it."""
         from minigrid.core.constants import COLOR_TO_IDX, OBJECT_TO_IDX
 
-        self.restore(snapshot)
         image = np.array(self.env.grid.encode())
         column, row = self.env.agent_pos
         image[int(column), int(row)] = (OBJECT_TO_IDX["agent"], COLOR_TO_IDX["red"], self.env.agent_dir)

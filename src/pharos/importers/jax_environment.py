@@ -5,7 +5,7 @@ actions and outcomes of the draws (`jax_chance`).
 import hashlib
 import math
 import random as python_random
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Sequence
 from fractions import Fraction
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ from pharos.importers.fresh_play import FreshPlay
 from pharos.importers.gymnasium import SAMPLED_EPISODE, SAMPLED_STEPS
 from pharos.importers.jax_chance import Traced, TracedFunction, refusal_behind
 from pharos.importers.jax_stepping import JaxFunctions
-from pharos.importers.search import END, Arrival, SteppedStates
+from pharos.importers.search import END, Arrival, ExpansionsHere, SteppedStates
 from pharos.importers.side_effects import SideEffects
 from pharos.importers.step_spaces import SpaceRecorder
 from pharos.importers.stepped_environment import (
@@ -352,11 +352,11 @@ class JaxEnvironment:
         """Whole numbers that a state holds, by the names of their fields."""
         return self.layout.integers(saved)
 
-    def expansions(self, workers: int) -> "JaxExpansions":
+    def expansions(self, workers: int) -> ExpansionsHere:
         """States of the frontier, stepped together."""
         if workers > 1:
             raise ParameterError(f"{self.name}: workers are {workers}; JAX steps states side by side, in one process")
-        return JaxExpansions(self)
+        return ExpansionsHere(self.expanded, self.at_once)
 
     # Checks -----------------------------------------------------------------------------------------------------------
 
@@ -455,34 +455,6 @@ def _probabilities(weights: list[Fraction], shares: list[np.ndarray], count: int
     if not shares:
         return repeated
     return (np.array([float(weight) for weight in repeated]) * np.prod(shares, axis=0)).tolist()
-
-
-class JaxExpansions:
-    """States that are stepped together, as many as the frontier has and the program takes.
-
-    Attributes:
-        room: states that it takes before the first has to be fetched.
-    """
-
-    def __init__(self, source: JaxEnvironment):
-        self.room = source.at_once
-        self._source = source
-        self._states: deque[bytes] = deque()
-        self._results: deque[list[list[Arrival]]] = deque()
-
-    def submit(self, saved: bytes) -> None:
-        """Add a state."""
-        self._states.append(saved)
-
-    def fetch(self) -> list[list[Arrival]]:
-        """The outcomes of the first state that was not fetched."""
-        if not self._results:
-            self._results.extend(self._source.expanded(list(self._states)))
-            self._states.clear()
-        return self._results.popleft()
-
-    def close(self) -> None:
-        """Nothing works elsewhere."""
 
 
 class JaxPlay(FreshPlay):

@@ -5,7 +5,7 @@ Nothing has to be copied: a state is a value. Chance is enumerated by a tape, se
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pharos.errors import MissingExtra, ParameterError
 from pharos.importers.chance import MOST_DRAW_OUTCOMES
@@ -14,6 +14,9 @@ from pharos.importers.stepped_environment import Payment, SteppingOptions
 from pharos.importers.stepping import MOST_STEPPED_STATES, SteppingRun, StepRecording
 from pharos.mdp import TabularMDP, whole_number
 from pharos.system.wording import in_one_line
+
+if TYPE_CHECKING:
+    from pharos.importers.jax_environment import JaxEnvironment
 
 
 @dataclass(frozen=True)
@@ -91,7 +94,7 @@ def jax_stepping(  # noqa: PLR0913  (options of one import)
     return run.finish(gamma, progress)
 
 
-def jax_source(factory: Callable[[], JaxFunctions], options: SteppingOptions) -> Any:
+def jax_source(factory: Callable[[], JaxFunctions], options: SteppingOptions) -> "JaxEnvironment":
     """The source of states of functions in JAX; MissingExtra if JAX is not there."""
     try:
         import jax
@@ -164,11 +167,11 @@ class PgxEnvironment:
                 f"with a step_env in which the others move as well"
             )
 
-        def step(key: Any, state: Any, action: Any) -> tuple:
+        def step(key: object, state: Any, action: object) -> tuple:
             after = env.step(state, action, key)
             return after.observation, after, after.rewards[0], after.terminated | after.truncated
 
-        def reset(key: Any) -> tuple:
+        def reset(key: object) -> tuple:
             state = env.init(key)
             return state.observation, state
 

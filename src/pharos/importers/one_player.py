@@ -43,7 +43,7 @@ class OnePlayer:
         """This environment: nothing is wrapped around it."""
         return self
 
-    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: object = None) -> tuple[Any, dict[str, Any]]:
         """Begin a game; the others move until it is the player's turn."""
         if seed is not None:
             self.np_random = np.random.default_rng(seed)
@@ -51,7 +51,7 @@ class OnePlayer:
         self._others_move()
         return self._shown(self.player)[0], {}
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: object) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Move, and let the others move."""
         self.game.step(action)
         payment = self._payment() + self._others_move()
@@ -72,7 +72,7 @@ class OnePlayer:
             payment += self._payment()
         raise ParameterError(f"{self.player}: had no turn in {MOST_TURNS:,} moves of the others")
 
-    def _move(self, name: str) -> Any:
+    def _move(self, name: str) -> object:
         observation, legal = self._shown(name)
         policy = self.policies.get(name)
         if policy is not None:

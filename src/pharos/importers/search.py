@@ -1,12 +1,13 @@
-"""Breadth-first enumeration of anything that can be saved, restored and stepped: `explore`, and the MDP that results.
+"""Breadth-first enumeration of what can be saved, restored and stepped: `BreadthFirst`, and the MDP that results.
 
-A source hands over saved states and takes them back: bytes of a console, pickles of an environment. States have keys;
-equal keys are one state. A saved state is dropped as soon as it has been expanded, so that memory holds only the
+A source hands over saved states and takes them back: pickles of an environment, rows of arrays of JAX. States have
+keys. Equal keys are one state. A saved state is dropped as soon as it has been expanded, so that memory holds only the
 frontier.
 """
 
 import time
 from array import array
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -37,7 +38,7 @@ class Arrival(NamedTuple):
     probability: Fraction | float
     reward: float
     key: bytes | None
-    saved: Any = None
+    saved: bytes | None = None
     observation: np.ndarray | None = None
     script: tuple[int, ...] = ()
 
@@ -50,15 +51,9 @@ class Steppable(Protocol):
     @property
     def num_actions(self) -> int:
         """Number of actions."""
-        ...
 
     def starts(self) -> list[Arrival]:
         """The states in which episodes start, with their probabilities."""
-        ...
-
-    def expand(self, saved: Any) -> list[list[Arrival]]:
-        """The outcomes of each action in a saved state."""
-        ...
 
 
 class Expansions(Protocol):
@@ -70,35 +65,38 @@ class Expansions(Protocol):
 
     room: int
 
-    def submit(self, saved: Any) -> None:
+    def submit(self, saved: bytes) -> None:
         """Add a state."""
-        ...
 
     def fetch(self) -> list[list[Arrival]]:
         """The outcomes of the first state that was submitted and not fetched so far."""
-        ...
 
     def close(self) -> None:
         """End what works for it."""
-        ...
 
 
 class ExpansionsHere:
-    """States that are expanded in this process, one after the other."""
+    """States that are expanded in this process, as many together as there are, up to `room`.
 
-    room = 1
+    Args:
+        expanded: (saved states) -> the outcomes of each action in each of them.
+    """
 
-    def __init__(self, source: Steppable):
-        self._source = source
-        self._saved: Any = None
+    def __init__(self, expanded: Callable[[list[bytes]], list[list[list[Arrival]]]], room: int = 1):
+        self._expanded, self.room = expanded, room
+        self._states: list[bytes] = []
+        self._results: deque[list[list[Arrival]]] = deque()
 
-    def submit(self, saved: Any) -> None:
-        """Keep a state for `fetch`."""
-        self._saved = saved
+    def submit(self, saved: bytes) -> None:
+        """Add a state."""
+        self._states.append(saved)
 
     def fetch(self) -> list[list[Arrival]]:
-        """The outcomes of the state."""
-        return self._source.expand(self._saved)
+        """The outcomes of the first state that was not fetched."""
+        if not self._results:
+            self._results.extend(self._expanded(self._states))
+            self._states = []
+        return self._results.popleft()
 
     def close(self) -> None:
         """Nothing works elsewhere."""

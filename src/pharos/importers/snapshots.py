@@ -215,7 +215,7 @@ class EnvironmentSnapshots:
         """Stand-in for the functions of one line of code."""
         return self._templates.setdefault(function.__code__, _Template(function))
 
-    def restore(self, snapshot: bytes) -> Any:
+    def restore(self, snapshot: bytes) -> Stepped:
         """A copy of what `save` was given."""
         reader = pickle.Unpickler(io.BytesIO(snapshot))
         reader.persistent_load = self._referred  # type: ignore[method-assign,assignment]
@@ -267,7 +267,7 @@ class EnvironmentSnapshots:
         _tame(value, self.numpy)
         return len(self._outside) - 1
 
-    def _referred(self, name: Any) -> Any:
+    def _referred(self, name: int | str | tuple[str, str]) -> object:
         if isinstance(name, int):
             return self._outside[name]
         if name == "numpy":
@@ -511,7 +511,7 @@ class _Feeder:
                 self.feed(item)
 
 
-def _holds_hidden_state(kind: Any) -> bool:
+def _holds_hidden_state(kind: type) -> bool:
     """Whether objects of a class hold what is not in their fields: by methods for pickle, or a base class in C."""
     has_methods = kind.__reduce__ is not object.__reduce__ or kind.__reduce_ex__ is not object.__reduce_ex__
     return has_methods or any(not base.__flags__ & HEAP_TYPE for base in kind.__mro__[:-1])
@@ -520,7 +520,7 @@ def _holds_hidden_state(kind: Any) -> bool:
 _has_hidden_state = cast(Callable[[Any], bool], functools.cache(_holds_hidden_state))
 
 
-def _contents(cell: Any) -> Any:
+def _contents(cell: types.CellType) -> object:
     try:
         return cell.cell_contents
     except ValueError:  # empty
@@ -556,7 +556,7 @@ def _is_importable(value: object) -> bool:
     """Whether a class or function is found under its name."""
     if not isinstance(value, type | types.FunctionType):
         return False
-    target: Any = sys.modules.get(value.__module__)
+    target: object = sys.modules.get(value.__module__)
     for part in value.__qualname__.split("."):
         target = getattr(target, part, None)
     return target is value

@@ -6,6 +6,7 @@ Results keep the order of the states, so that the MDP is the same with any numbe
 
 import pickle  # noqa: TID251  (the error of a factory that no other process can import)
 from collections import deque
+from collections.abc import Callable
 from multiprocessing import Pipe, connection
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,7 @@ from pharos.importers.search import Arrival
 from pharos.system.workers import Workers
 
 if TYPE_CHECKING:
-    from pharos.importers.stepped_environment import SteppedEnvironment
+    from pharos.importers.stepped_environment import Factory, SteppedEnvironment, SteppingOptions
 
 STATES_PER_TASK = 16
 """States that a process gets at once. It gets the next when it has handed over their outcomes: one that sends does not
@@ -23,7 +24,9 @@ listen."""
 BLOCKS_AHEAD = 3
 
 
-def step_for_others(factory: Any, options: Any, jobs: connection.Connection, send: Any) -> None:
+def step_for_others(
+    factory: "Factory", options: "SteppingOptions", jobs: connection.Connection, send: Callable[[object], None]
+) -> None:
     """The body of a process: expand blocks of states until there are no more."""
     from pharos.importers.stepped_environment import ConstantChanged, SteppedEnvironment
 
@@ -36,7 +39,7 @@ def step_for_others(factory: Any, options: Any, jobs: connection.Connection, sen
                 number, block = jobs.recv()
                 if block is None:
                     return
-                send(("rows", number, [source.expand(saved) for saved in block]))
+                send(("rows", number, source.expanded(block)))
     except (PharosError, ConstantChanged) as error:
         kind = type(error) if isinstance(error, ConstantChanged) else RuleError
         send(("error", kind, str(error)))

@@ -10,7 +10,7 @@ from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from functools import partial
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from pharos.errors import ParameterError, PharosError, RuleError, UnknownName
 from pharos.importers import side_effects
 from pharos.importers.chance import MOST_DRAW_OUTCOMES, DrawError, DrawTree, line_of_code, placed
 from pharos.importers.fresh_play import FreshPlay
-from pharos.importers.search import Arrival, Expansions, ExpansionsHere, SteppedStates
+from pharos.importers.search import Arrival, Expansions, ExpansionsHere, Steppable, SteppedStates
 from pharos.importers.side_effects import SideEffects
 from pharos.importers.snapshots import EnvironmentSnapshots, bare, chain_of, field_names, integers_of, snapshot_digest
 from pharos.importers.step_spaces import SpaceRecorder, listed_actions_of
@@ -34,8 +34,9 @@ WALK_STEPS = 20
 REPEATED = 100
 """Each so many states are expanded twice, and the first 20 four times."""
 
+T = TypeVar("T")
 Factory: TypeAlias = Callable[[], Stepped]
-Visit: TypeAlias = Callable[[Stepped, Any, float, bool], None]
+Visit: TypeAlias = Callable[[Stepped, object, float, bool], None]
 """Takes (environment after a step, observation, reward, whether the episode ended)."""
 Run: TypeAlias = Callable[[Visit], None]
 """Visits each outcome of a reset or a step."""
@@ -67,6 +68,37 @@ class SteppingOptions:
 
 class ConstantChanged(Exception):
     """A table that all copies shared was changed by a step, or a counter that was left out matters."""
+
+
+class SteppedSource(Steppable, Protocol):
+    """A source that `stepping` imports: an environment of Gymnasium, or functions of JAX.
+
+    Attributes:
+        action_names, time_limit: of the environment. observer: what it shows. effects: what it did to the process.
+    """
+
+    action_names: tuple[str, ...] | None
+    time_limit: int | None
+    observer: SpaceRecorder
+    effects: SideEffects
+
+    def expansions(self, workers: int) -> Expansions:
+        """States to be expanded, here or by other processes."""
+
+    def arrive(self, saved: bytes | None, action: int, script: Sequence[int]) -> Arrival:
+        """Repeat an earlier step with these draws, from a saved state or from the reset (None)."""
+
+    def skip(self, keys: Sequence[bytes]) -> None:
+        """Hand over no saved states of these keys, which others have."""
+
+    def integers(self, saved: bytes) -> dict[str, int]:
+        """Whole numbers that a state holds, by the names of their fields."""
+
+    def compare(self, states: SteppedStates, horizon: int | None) -> None:
+        """RuleError if a new environment, with its own chance, does what the states say to be impossible."""
+
+    def check_rest(self) -> None:
+        """Checks when all states were expanded."""
 
 
 class SteppedEnvironment:
@@ -122,8 +154,11 @@ class SteppedEnvironment:
         """The states in which episodes start, with their probabilities."""
         return self._guarded({"reset()": self._reset_runs}, is_repeated=True)[0]
 
-    def expand(self, saved: bytes) -> list[list[Arrival]]:
-        """The outcomes of each action in a saved state."""
+    def expanded(self, states: Sequence[bytes]) -> list[list[list[Arrival]]]:
+        """The outcomes of each action in each of some saved states."""
+        return [self._expanded(saved) for saved in states]
+
+    def _expanded(self, saved: bytes) -> list[list[Arrival]]:
         self._num_expanded += 1
         is_repeated = self._num_expanded <= 20 or self._num_expanded % REPEATED == 0
         runs = {f"step({action})": partial(self._step_runs, saved, action) for action in self.actions}
@@ -156,7 +191,7 @@ class SteppedEnvironment:
 
     def expansions(self, workers: int) -> Expansions:
         """States that are expanded in this process, or by others."""
-        return ExpansionsHere(self) if workers == 1 else ExpansionsElsewhere(self, workers)
+        return ExpansionsHere(self.expanded) if workers == 1 else ExpansionsElsewhere(self, workers)
 
     def compare(self, states: SteppedStates, horizon: int | None) -> None:
         """RuleError if a new environment, with its own generators, does what the states say to be impossible."""
@@ -197,10 +232,10 @@ class SteppedEnvironment:
         finally:
             self.draws.sampler = None
 
-    def _reset(self, env: Stepped, seed: int | None = None) -> Any:
+    def _reset(self, env: Stepped, seed: int | None = None) -> object:
         return self._calling("reset()", lambda: reset(env, seed))
 
-    def step(self, env: Stepped, action: Any) -> tuple[Any, float, bool]:
+    def step(self, env: Stepped, action: object) -> tuple[object, float, bool]:
         """(observation, reward, whether the episode ends)."""
         what = f"step({action})"
         answer = self._calling(what, lambda: env.step(action))
@@ -214,7 +249,7 @@ class SteppedEnvironment:
             bool(ended) or truncated,
         )
 
-    def _calling(self, what: str, function: Callable[[], Any]) -> Any:
+    def _calling(self, what: str, function: Callable[[], T]) -> T:
         """Answer of a function of the environment; its errors become one line that names the line of its code."""
         try:
             answer = function()
@@ -241,7 +276,7 @@ class SteppedEnvironment:
             env = self.snapshots.restore(self._blank)
             visit(env, self._reset(env), 0.0, False)
 
-    def _step_runs(self, saved: bytes, action: Any, visit: Visit) -> None:
+    def _step_runs(self, saved: bytes, action: object, visit: Visit) -> None:
         """Visit each outcome of a step."""
         for _ in self._enumerated(f"step({action})"):
             env = self.snapshots.restore(saved)
@@ -259,7 +294,7 @@ class SteppedEnvironment:
         """The outcomes of a reset or of each step; errors if they depend on anything but the state and the draws."""
         rows: list[list[Arrival]] = []
 
-        def visit(env: Stepped, observation: Any, payment: float, ended: bool) -> None:
+        def visit(env: Stepped, observation: object, payment: float, ended: bool) -> None:
             key = None if ended else self.key_of(env)
             rows[-1].append(self._new_arrival(env, key, observation, payment))
 
@@ -282,7 +317,7 @@ class SteppedEnvironment:
         """(probability, key, reward) of each outcome."""
         signatures: list[tuple] = []
 
-        def visit(env: Stepped, _: Any, payment: float, ended: bool) -> None:
+        def visit(env: Stepped, _: object, payment: float, ended: bool) -> None:
             signatures.append((self.draws.probability, None if ended else self.key_of(env), payment))
 
         run(visit)
@@ -318,7 +353,7 @@ class SteppedEnvironment:
 
     # Arrivals ---------------------------------------------------------------------------------------------------------
 
-    def _new_arrival(self, env: Stepped, key: bytes | None, observation: Any, payment: float) -> Arrival:
+    def _new_arrival(self, env: Stepped, key: bytes | None, observation: object, payment: float) -> Arrival:
         """The outcome that was just stepped to; with the state if this is the first time."""
         probability, script = self.draws.probability, self.draws.script
         if key is not None and key not in self._sent:
@@ -328,7 +363,7 @@ class SteppedEnvironment:
             self._check_pair(env, key)
         return Arrival(probability, payment, key, script=script)
 
-    def _arrival(self, env: Stepped, key: bytes | None, observation: Any, payment: float) -> Arrival:
+    def _arrival(self, env: Stepped, key: bytes | None, observation: object, payment: float) -> Arrival:
         if key is None:
             return Arrival(self.draws.probability, payment, None, script=self.draws.script)
         saved = self.snapshots.save(env)
@@ -401,7 +436,7 @@ class SteppedEnvironment:
             f"something that matters"
         )
 
-    def _shares(self, saved: bytes, action: Any) -> dict[tuple, Fraction]:
+    def _shares(self, saved: bytes, action: object) -> dict[tuple, Fraction]:
         """(key, reward) -> probability."""
         shares: dict[tuple, Fraction] = {}
         for probability, key, payment in self._signatures(partial(self._step_runs, saved, action)):
@@ -466,7 +501,7 @@ class ClockSearch:
         fields: names -> value at depth 0, of the fields that have counted steps so far.
     """
 
-    source: Any
+    source: SteppedSource
     fields: dict[str, int] | None = None
     num_depths: int = 0
     _looks: Counter = field(default_factory=Counter)

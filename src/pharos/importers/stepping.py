@@ -22,6 +22,7 @@ from pharos.importers.stepped_environment import (
     Factory,
     Payment,
     SteppedEnvironment,
+    SteppedSource,
     SteppingOptions,
 )
 from pharos.importers.wrappers import Stepped
@@ -136,7 +137,7 @@ class SteppingRun:
     check: bool = True
     checkpoint: StepCheckpoint | None = None
     workers: int = 1
-    source_of: Callable[[Any, SteppingOptions], Any] = SteppedEnvironment
+    source_of: Callable[[Any, SteppingOptions], SteppedSource] = SteppedEnvironment
 
     def __post_init__(self) -> None:
         if self.horizon is not None:
@@ -167,7 +168,7 @@ class SteppingRun:
         return mdp, StepRecording(observations, observed, outcomes, source.action_names, limit, depths, notes)
 
     def _states(
-        self, source: Any, progress: Callable[[SteppedStates, float, bool], None] | None
+        self, source: SteppedSource, progress: Callable[[SteppedStates, float, bool], None] | None
     ) -> tuple[SteppedStates, ClockSearch]:
         clocks = ClockSearch(source)
         search = BreadthFirst(

@@ -32,6 +32,7 @@ from pharos.system.wording import in_words
 from pharos.training import GAIN_TOLERANCE, read_curve, read_record
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -126,7 +127,7 @@ def _spread(result: dict[str, Any], average: bool) -> float:
     return math.nan if uniform is None else result["value_optimal"] - uniform
 
 
-def _with_averages(curve: Any, result: dict[str, Any]) -> Any:
+def _with_averages(curve: "pd.DataFrame", result: dict[str, Any]) -> "pd.DataFrame":
     """A curve with the middle of its average regret, the same normalised, and summed over steps, if it has them."""
     if "average_regret_lower" not in curve:
         return curve

@@ -148,7 +148,7 @@ class _Named(_Part):
     name: str
     _folder: Path | None = PrivateAttr(None)
 
-    def model_post_init(self, context: Any) -> None:
+    def model_post_init(self, context: dict[str, Any] | None) -> None:
         self._folder = (context or {}).get("folder") if is_reference(self.name) else None
 
 

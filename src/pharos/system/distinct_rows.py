@@ -9,7 +9,6 @@ import math
 import zlib
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -67,10 +66,10 @@ class DistinctRows:
         """Number of chunks of the distinct rows."""
         return -(-self.num_distinct // self.rows_in_chunk)
 
-    def __getitem__(self, rows: Any) -> np.ndarray:
+    def __getitem__(self, rows: int | slice | np.ndarray) -> np.ndarray:
         return self.distinct(self.index[rows])
 
-    def distinct(self, numbers: Any) -> np.ndarray:
+    def distinct(self, numbers: npt.ArrayLike) -> np.ndarray:
         """Distinct rows by their numbers: of one number, or of an array (M,)."""
         if np.ndim(numbers) == 0:
             return self.distinct(np.array([numbers]))[0]

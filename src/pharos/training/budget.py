@@ -203,7 +203,7 @@ class CountedEnv(gymnasium.Wrapper):
         observation, info = self.env.reset(seed=seed)
         return observation, _public(info)
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: object) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Step as in Gymnasium. Raises BudgetSpent if no steps are left, ParameterError in another process."""
         budget = self.budget
         budget.check_process()
@@ -280,7 +280,9 @@ class Snapshots:
             self._kept = blocks
 
 
-def _answer(answers: PolicyAnswers, policy: PolicyLike, observations: Any, count: int) -> np.ndarray:
+def _answer(
+    answers: PolicyAnswers, policy: PolicyLike, observations: np.ndarray | dict[str, np.ndarray], count: int
+) -> np.ndarray:
     """(N, A) probabilities. ParameterError, one line that says what was asked, for an error in the policy's code."""
     try:
         return answers.answer(observations, count)

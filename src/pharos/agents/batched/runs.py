@@ -272,7 +272,7 @@ def _net_arch(hyperparameters: Mapping[str, Any]) -> Any:
     return (hyperparameters.get("policy_kwargs") or {}).get("net_arch", layers)
 
 
-def _is_in_steps(value: Any) -> bool:
+def _is_in_steps(value: int | tuple[int, str]) -> bool:
     return isinstance(value, int) or (len(value) == 2 and value[1] == "step")
 
 
