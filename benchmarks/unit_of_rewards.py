@@ -27,8 +27,9 @@ RATE = 0.1
 
 
 @njit
-def squared(q, q_next, q_choice, actions, rewards, discounts, dq, loss):
+def squared(q, q_next, q_choice, minibatch, dq, loss):
     """The gradient of the squared loss, halved; see `kernels.huber`."""
+    actions, rewards, discounts = minibatch
     dq[:] = 0.0
     for i in range(q.shape[0]):
         for b in range(q.shape[1]):
@@ -38,8 +39,9 @@ def squared(q, q_next, q_choice, actions, rewards, discounts, dq, loss):
 
 
 @njit
-def descent(parameters, gradients, means, squares, counts, is_active, rates, max_norms, eps):
+def descent(state, counts, is_active, rates, max_norms, eps):
     """A step of plain gradient descent with the same clipping; see `kernels.adam`."""
+    parameters, gradients, _, _ = state
     for i in range(len(parameters)):
         if is_active[i]:
             counts[i] += 1

@@ -115,7 +115,7 @@ def test_dqn_learns_from_the_frames_that_stable_baselines3_keeps(sight, n_steps,
     rewards, factors = (np.zeros((lane.width, size), np.float32) for _ in range(2))
     batch = (states, nexts, actions, rewards, factors)
     gammas = lane.own["gamma"]
-    batched.sample_histories(lane.keys, 7, 0, place, memory.size, gammas, n_steps, memory.memory, batch)
+    batched.sample_histories(lane.keys, (7, 0), (place, memory.size), gammas, n_steps, memory.memory, batch)
     rows, copies = drawn_rows(lane, size, memory.size)
     assert set(rows.tolist()) == set(range(memory.size)), "all of the memory is among them"
     monkeypatch.setattr(np.random, "randint", lambda *_, **__: copies)

@@ -169,7 +169,7 @@ def assert_same_minibatch(lane, model, monkeypatch):
     states, nexts, actions = (np.zeros((lane.width, size), np.int64) for _ in range(3))
     rewards, factors = (np.zeros((lane.width, size), np.float32) for _ in range(2))
     batch, place, steps = (states, nexts, actions, rewards, factors), lane.calls % memory.size, lane.shared["n_steps"]
-    batched.sample(lane.keys, 7, 0, place, filled, lane.own["gamma"], int(steps), memory.memory, batch)
+    batched.sample(lane.keys, (7, 0), (place, filled), lane.own["gamma"], int(steps), memory.memory, batch)
     rows, copies = drawn_rows(lane, size, filled)
     assert {place, (place - 1) % filled} & set(rows.tolist()), "the ends of the memory are among them"
     monkeypatch.setattr(np.random, "randint", lambda *_, **__: copies)

@@ -110,13 +110,8 @@ class QLearning:
             float(options["exploration_schedule"] == "exponential"),
             float(mdp.gamma),
         )
-        episodes = Episodes(
-            np.asarray(mdp.terminal, np.bool_),
-            mdp.start_states,
-            cumulative,
-            (*mdp.chance.triple, float(mdp.chance.first_chosen), *sets),
-            int(self.limit),
-        )
+        chance = (*mdp.chance.triple, float(mdp.chance.first_chosen), *sets)
+        episodes = Episodes(np.asarray(mdp.terminal, np.bool_), mdp.start_states, cumulative, chance, int(self.limit))
         learner = (self.q, self.visits, self.cursor, self.sums, self.word)
         noise = (self.reward_noise, self.pending, self.noise_word)
         q_learning(self._transitions, mdp.reward_table.for_kernels, episodes, schedule, learner, noise, int(steps))

@@ -84,15 +84,9 @@ class HubBounds:
 
     def __init__(self, mdp: TabularMDP, restart: bool):
         chance, num_actions = mdp.chance, mdp.num_actions
-        self._execution = hitting.ExecutionWeights(
-            chance.chosen,
-            chance.previous,
-            chance.uniform / num_actions,
-            chance.first_chosen,
-            chance.first_uniform / num_actions,
-            mdp.policy_width - 1,
-            num_actions,
-        )
+        weights = (chance.chosen, chance.previous, chance.uniform / num_actions)
+        first = (chance.first_chosen, chance.first_uniform / num_actions)
+        self._execution = hitting.ExecutionWeights(*weights, *first, mdp.policy_width - 1, num_actions)
         self._outcomes = _outcome_lists(mdp, restart)
         size = len(self._outcomes.node)
         self._num_nodes = len(self._outcomes.first) - 1

@@ -185,29 +185,26 @@ def execute_runs_in_sets(keys, step, chances, sets, previous, actions, executed)
                 executed[i, e] = executed_of_set(actions[i, e], previous[i, e], chance, sets[i, e], u)
 
 
-@kernel
-def advance(
-    transitions, rewards, staying, terminal, starts, cumulative, runs, setting, knobs, actions, episodes, pending,
-    transition, counts,
-):  # fmt: skip
+@kernel(makes_arrays=False)
+def advance(world, setting, actions, episodes, transition, counts):
     """One step of every copy of `runs`, which share an MDP. Episodes that have ended start anew.
 
-    transitions: see kernels/outcomes.py. rewards: see `outcome_reward`. staying (S, A): the reward of an action without
-        effect, (0, 0) if all have one. terminal: (S,). starts, cumulative: start states and their cumulated
-    probabilities.
-    setting: (keys (W,) uint64, step, chances (W, 4), limits (W,), gammas (W,)), as in `stepping.Setting`.
-    knobs (W, 4): the probability that an action has no effect, the deviation of the noise of rewards, their delay in
-    steps, and what they are divided by.
-    pending (W, E, D): rewards earned and not paid yet, see `delayed_reward`.
-    episodes: (state, previous, elapsed (W, E) int64, return, discount (W, E) float64) of the running episodes, and
-    (number, sum of returns (W,)) of the finished ones, which this step adds to if `counts` is true.
+    world: (transitions, rewards, staying, terminal, starts, cumulative, runs). See kernels/outcomes.py for transitions
+    and `outcome_reward` for rewards. staying (S, A): the reward of an action without effect, (0, 0) if all have one.
+    terminal: (S,). starts, cumulative: start states and their cumulated probabilities.
+    setting: (keys (W,) uint64, step, chances (W, 4), limits (W,), gammas (W,), knobs), the first five as in
+    `stepping.Setting`. knobs (W, 4): the probability that an action has no effect, the deviation of the noise of
+    rewards, their delay in steps, and what they are divided by.
+    episodes: (state, previous, elapsed (W, E) int64, return, discount (W, E) float64) of the running episodes,
+    (number, sum of returns (W,)) of the finished ones, which this step adds to if `counts` is true, and pending
+    (W, E, D), rewards earned and not paid yet, see `delayed_reward`.
     transition: (next state (W, E) int64, reward (W, E) float64, flags (W, E) uint8) of this step, written here. The
-        reward is the paid one, returns are of earned rewards. A transition that ends an episode without a next state
-        has
+    reward is the paid one, returns are of earned rewards. A transition that ends an episode without a next state has
     the state itself there.
     """
-    keys, step, chances, limits, gammas = setting
-    state, previous, elapsed, running, discount, finished, returns = episodes
+    transitions, rewards, staying, terminal, starts, cumulative, runs = world
+    keys, step, chances, limits, gammas, knobs = setting
+    state, previous, elapsed, running, discount, finished, returns, pending = episodes
     next_states, reward, flags = transition
     num_actions = size_of(transitions)[1]
     for i in runs:
@@ -276,44 +273,46 @@ def act(keys, step, scores, actions, log_probabilities):
             log_probabilities[i, e] = np.float64(scores[i, e, action] - best) - np.log(total)
 
 
-@kernel
-def sample(keys, step, draw, next_row, filled, gammas, num_steps, memory, batch):
+@kernel(makes_arrays=False)
+def sample(keys, draw, rows, gammas, num_steps, memory, batch):
     """Draw a minibatch of each run from its replay memory, uniformly, with returns of `num_steps` steps.
 
-    next_row: the row that is written next. filled: the number of rows that are. gammas: (W,).
+    draw: (step, number of the draw in it). rows: (the one that is written next, how many are written). gammas: (W,).
     memory: (state, next state (W, R, E), action (W, R, E), reward (W, R, E) float32, flags (W, R, E)).
     batch: (state, next state (W, B), action (W, B), reward (W, B) float32, discount (W, B) float32), written here:
     discount is the factor of the value of the next state: gamma^n, 0 if the episode ended there. A return stops at
     the end of an episode, at a time limit, and at the newest transition.
     """
-    state, next_state, action, reward, flags = memory
+    state, next_state, action, _, _ = memory
     states, next_states, actions, rewards, discounts = batch
     size, copies = state.shape[1], state.shape[2]
+    next_row, filled = rows
     last = (next_row - 1) % size
     for i in range(states.shape[0]):
         for b in range(states.shape[1]):
-            w = philox(b, draw, step, SAMPLE, keys[i])
+            w = philox(b, draw[1], draw[0], SAMPLE, keys[i])
             row, e = below(w[0], filled), below(w[1], copies)
-            at, rewards[i, b], discounts[i, b] = _steps_from(i, row, e, last, gammas[i], num_steps, reward, flags)
+            at, rewards[i, b], discounts[i, b] = _steps_from(i, row, e, last, gammas[i], num_steps, memory)
             states[i, b], actions[i, b], next_states[i, b] = state[i, row, e], action[i, row, e], next_state[i, at, e]
 
 
-@kernel
-def sample_histories(keys, step, draw, next_row, filled, gammas, num_steps, memory, batch):
-    """`sample` from the `filled` newest rows, with states and next states (W, B, k): the last k of the episode.
+@kernel(makes_arrays=False)
+def sample_histories(keys, draw, rows, gammas, num_steps, memory, batch):
+    """`sample` from the newest rows, with states and next states (W, B, k): the last k of the episode.
 
     They are read from the rows before. The first state of an episode stands for those before it. Rows that were never
     written have the flag ENDED.
     """
-    state, next_state, action, reward, flags = memory
+    state, next_state, action, _, flags = memory
     states, next_states, actions, rewards, discounts = batch
     size, copies, frames = state.shape[1], state.shape[2], states.shape[2]
+    next_row, filled = rows
     first, last = (next_row - filled) % size, (next_row - 1) % size
     for i in range(states.shape[0]):
         for b in range(states.shape[1]):
-            w = philox(b, draw, step, SAMPLE, keys[i])
+            w = philox(b, draw[1], draw[0], SAMPLE, keys[i])
             row, e = (first + below(w[0], filled)) % size, below(w[1], copies)
-            at, rewards[i, b], discounts[i, b] = _steps_from(i, row, e, last, gammas[i], num_steps, reward, flags)
+            at, rewards[i, b], discounts[i, b] = _steps_from(i, row, e, last, gammas[i], num_steps, memory)
             actions[i, b] = action[i, row, e]
             # the next history is the history of the last row, moved on by its next state
             _last_states(i, row, e, state, flags, states[i, b])
@@ -323,9 +322,10 @@ def sample_histories(keys, step, draw, next_row, filled, gammas, num_steps, memo
             next_states[i, b, frames - 1] = next_state[i, at, e]
 
 
-@kernel
-def _steps_from(i, row, e, last, gamma, num_steps, reward, flags):
+@kernel(makes_arrays=False)
+def _steps_from(i, row, e, last, gamma, num_steps, memory):
     """(last row, return, discount of the value after it) of at most `num_steps` steps from a row."""
+    _, _, _, reward, flags = memory
     size = reward.shape[1]
     total, factor, at = 0.0, 1.0, row
     for n in range(num_steps):
@@ -338,7 +338,7 @@ def _steps_from(i, row, e, last, gamma, num_steps, reward, flags):
     return at, float32(total), float32(0.0) if ended else float32(factor)
 
 
-@kernel
+@kernel(makes_arrays=False)
 def _last_states(i, row, e, state, flags, out):
     """out (k,) = the state of a row and of up to k - 1 rows before it in its episode, the oldest first."""
     size = state.shape[1]
@@ -349,13 +349,14 @@ def _last_states(i, row, e, state, flags, out):
             row = before
 
 
-@kernel
-def huber(q, q_next, q_choice, actions, rewards, discounts, dq, loss):
+@kernel(makes_arrays=False)
+def huber(q, q_next, q_choice, minibatch, dq, loss):
     """The smooth L1 loss of DQN, (W,), and its gradient dq (W, B, A).
 
     q: (W, B, A) of the states. q_next: of the next states, by the target network. q_choice: what the next action is
-    the best of: q_next itself, or by the online network (double).
+    the best of: q_next itself, or by the online network (double). minibatch: (actions, rewards, discounts), (W, B).
     """
+    actions, rewards, discounts = minibatch
     num_rows, num_actions = q.shape[1], q.shape[2]
     share = float32(1.0) / float32(num_rows)
     for i in range(q.shape[0]):
@@ -397,12 +398,13 @@ def _adam(parameters, gradient, mean, square, scale, step, eps):
         parameters[j] -= step * m / (np.sqrt(v) + eps)
 
 
-@kernel
-def adam(parameters, gradients, means, squares, counts, is_active, rates, max_norms, eps):
+@kernel(makes_arrays=False)
+def adam(state, counts, is_active, rates, max_norms, eps):
     """One step of Adam (betas 0.9 and 0.999) for the active runs, by gradients clipped to a norm.
 
-    parameters, gradients, means, squares: (W, P) float32. counts (W,): steps so far. rates, max_norms: (W,).
+    state: (parameters, gradients, means, squares), (W, P) float32. counts (W,): steps so far. rates, max_norms: (W,).
     """
+    parameters, gradients, means, squares = state
     for i in range(len(parameters)):
         if is_active[i]:
             counts[i] += 1
@@ -435,13 +437,15 @@ def linear_row(parameters, weight, bias, x, is_relu, y):
             y[i, j] = max(total[j], float32(0.0)) if is_relu else total[j]
 
 
-@kernel
-def advantages(rewards, values, begins, last_values, ends, gammas, lambdas, out):
+@kernel(makes_arrays=False)
+def advantages(rollout, last_values, ends, gammas, lambdas, out):
     """out (W, T, E) = generalised advantages of rollouts of T steps.
 
-    rewards, values, begins (W, T, E) float32: begins is 1 if a step is the first of an episode. last_values (W, E): of
-    the states after the rollout. ends (W, E): whether the last step ended an episode. gammas, lambdas: (W,).
+    rollout: (rewards, values, begins), (W, T, E) float32: begins is 1 if a step is the first of an episode.
+    last_values (W, E): of the states after the rollout. ends (W, E): whether the last step ended an episode.
+    gammas, lambdas: (W,).
     """
+    rewards, values, begins = rollout
     num_steps, copies = rewards.shape[1], rewards.shape[2]
     for i in range(rewards.shape[0]):
         gamma, both = float32(gammas[i]), float32(gammas[i] * lambdas[i])
@@ -501,12 +505,15 @@ def normalize_advantages(advantages):
 
 
 @kernel
-def clipped_loss(scores, values, minibatch, clip_ranges, entropy_weights, value_weights, dscores, dvalues, loss, kl):
+def clipped_loss(scores, values, minibatch, weights, gradients, loss, kl):
     """The loss of PPO (W,), its gradients, and the approximate divergence from the old policy (W,).
 
-    scores (W, B, A), values (W, B, 1) float32, and dscores and dvalues (gradients) of the same shapes.
+    scores (W, B, A), values (W, B, 1) float32. gradients: of both, of the same shapes.
     minibatch: (actions, old logarithms of probabilities, advantages, returns), (W, B) each.
+    weights: (clip range, of the entropy, of the value), (W,) each.
     """
+    clip_ranges, entropy_weights, value_weights = weights
+    dscores, dvalues = gradients
     actions, old, advantage, returns = minibatch
     number, num_actions = scores.shape[1], scores.shape[2]
     log_p = np.empty(num_actions)

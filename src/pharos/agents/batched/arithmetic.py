@@ -103,8 +103,7 @@ class CompiledArithmetic:
     ) -> None:
         """Write the Huber loss of DQN (W,) and its gradient. minibatch: (actions, rewards, discounts) (W, B)."""
         q_arrays = q.numpy(), q_next.numpy(), q_choice.numpy()
-        actions, rewards, discounts = (part.numpy() for part in minibatch)
-        kernels.huber(*q_arrays, actions, rewards, discounts, dq.numpy(), loss.array)
+        kernels.huber(*q_arrays, tuple(part.numpy() for part in minibatch), dq.numpy(), loss.array)
 
     def clipped_loss(
         self, scores: Tensor, values: Tensor, minibatch: Sequence[Tensor], weights: Sequence[Tensor],
@@ -117,10 +116,8 @@ class CompiledArithmetic:
             gradients: of scores and values, written.
             loss, divergence: (W,), written.
         """
-        arrays = tuple(part.numpy() for part in minibatch)
-        own = tuple(part.numpy() for part in weights)
-        written = (*(gradient.numpy() for gradient in gradients), loss.array, divergence.array)
-        kernels.clipped_loss(scores.numpy(), values.numpy(), arrays, *own, *written)
+        tuples = (tuple(part.numpy() for part in parts) for parts in (minibatch, weights, gradients))
+        kernels.clipped_loss(scores.numpy(), values.numpy(), *tuples, loss.array, divergence.array)
 
     def plan(
         self, counts: np.ndarray, is_active: np.ndarray, rates: np.ndarray, max_norms: np.ndarray, eps: float
@@ -135,8 +132,7 @@ class CompiledArithmetic:
     def adam(self, state: Sequence[Tensor]) -> None:
         """Adam step set by `plan`. state: (parameters, gradients, means, squares), (W, P) each."""
         assert self._steps is not None
-        parameters, gradients, means, squares = (tensor.numpy() for tensor in state)
-        kernels.adam(parameters, gradients, means, squares, *self._steps)
+        kernels.adam(tuple(tensor.numpy() for tensor in state), *self._steps)
 
 
 class TensorArithmetic(CompiledArithmetic):

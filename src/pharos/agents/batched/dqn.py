@@ -72,9 +72,9 @@ class Replay:
     def sample(self, calls: int, draw: int, gammas: np.ndarray, num_steps: int) -> None:
         """Draw a minibatch for each run that is not idle, after `calls` steps, see `kernels.sample`."""
         batch = tuple(part.array[: self.number] for part in self.drawn)
-        filled = min(calls, self.size)
+        rows = calls % self.rows, min(calls, self.size)
         keys, draws = self.keys[: self.number], kernels.sample if self.frames == 1 else kernels.sample_histories
-        draws(keys, calls, draw, calls % self.rows, filled, gammas, num_steps, self.memory, batch)
+        draws(keys, (calls, draw), rows, gammas, num_steps, self.memory, batch)
 
     def arrays(self, calls: int) -> dict[str, np.ndarray]:
         """The filled rows of the memory, by name."""

@@ -235,7 +235,7 @@ POLICY_BLOCKS = (16, 64, 256)  # rows of the blocks in which a policy is asked
 class Lane(Generic[Net]):
     """W runs of one group. If there are fewer, the last rows are idle: they repeat the first run.
 
-    The same run has the same bits whoever else is there: each run's part of every buffer and product is apart.
+    Results of a run are bitwise independent of the other runs: no buffer or product is shared.
 
     Attributes:
         number: of runs that are not idle.
@@ -479,14 +479,13 @@ class World:
     def __init__(self, run: BatchRun, runs: Sequence[int]):
         mdp, dynamics = run.mdp, run.mdp.dynamics
         self.runs = np.array(runs, np.int64)
-        self.transitions = dynamics.for_steps
-        self.rewards: tuple[Any, ...] = mdp.reward_table.for_kernels
+        rewards: tuple[Any, ...] = mdp.reward_table.for_kernels
         if run.outcome_rewards is not None and not dynamics.is_deterministic:
-            self.rewards = dynamics.for_kernels_with(run.outcome_rewards)  # type: ignore[attr-defined]
-        self.staying = np.zeros((0, 0)) if run.staying is None else np.asarray(run.staying, np.float64)
-        self.terminal = np.asarray(mdp.terminal, np.bool_)
-        self.starts = np.asarray(mdp.start_states, np.int64)
-        self.cumulative = np.cumsum(mdp.start_probabilities)
+            rewards = dynamics.for_kernels_with(run.outcome_rewards)  # type: ignore[attr-defined]
+        staying = np.zeros((0, 0)) if run.staying is None else np.asarray(run.staying, np.float64)
+        self.starts = (np.asarray(mdp.start_states, np.int64), np.cumsum(mdp.start_probabilities))
+        terminal = np.asarray(mdp.terminal, np.bool_)
+        self.for_kernels = (dynamics.for_steps, rewards, staying, terminal, *self.starts, self.runs)
 
 
 class BatchedEpisodes:
@@ -534,7 +533,7 @@ class BatchedEpisodes:
         self.next_state = np.zeros((width, copies), np.int64)
         self.reward, self.flags = np.zeros((width, copies)), np.zeros((width, copies), np.uint8)
         for world in self.worlds:
-            kernels.start(keys, world.runs, world.starts, world.cumulative, self.state)
+            kernels.start(keys, world.runs, *world.starts, self.state)
         self.depth = (frames,) if frames > 1 else ()
         self.history = np.repeat(self.state[..., None], frames, axis=2)
         self.next_history = self.history.copy()
@@ -556,14 +555,12 @@ class BatchedEpisodes:
             choices, actions, chances = actions, np.empty_like(actions), self._none
             sets = self._sets.of_episodes(self.state)
             kernels.execute_runs_in_sets(self.keys, step, self._chances, sets, self.previous, choices, actions)
-        setting = (self.keys, step, chances, self._limits, self._gammas)
-        episodes = (self.state, self.previous, self.elapsed, self.running, self.discount, self.episodes, self.returns)
+        setting = (self.keys, step, chances, self._limits, self._gammas, self._knobs)
+        running = (self.state, self.previous, self.elapsed, self.running, self.discount)
+        episodes = (*running, self.episodes, self.returns, self.pending)
         transition = (self.next_state, self.reward, self.flags)
         for world in self.worlds:
-            kernels.advance(
-                world.transitions, world.rewards, world.staying, world.terminal, world.starts, world.cumulative,
-                world.runs, setting, self._knobs, actions, episodes, self.pending, transition, counts,
-            )  # fmt: skip
+            kernels.advance(world.for_kernels, setting, actions, episodes, transition, counts)
         if self.depth:
             self.next_history[..., :-1], self.next_history[..., -1] = self.history[..., 1:], self.next_state
             ended = (self.flags & kernels.ENDED) > 0

@@ -86,10 +86,8 @@ class PPOLane(Lane[ActorCritics]):
         """See `Lane`."""
         self.add_values_of_cut_episodes()
         last = self.values_of(self.worlds.seen)
-        kernels.advantages(
-            self.rewards, self.kept_values, self.begins, last, self.begin > 0, self.own["gamma"],
-            self.own["gae_lambda"], self.advantages,
-        )  # fmt: skip
+        rollout, decays = (self.rewards, self.kept_values, self.begins), (self.own["gamma"], self.own["gae_lambda"])
+        kernels.advantages(rollout, last, self.begin > 0, *decays, self.advantages)
         returns = self.advantages + self.kept_values
         parts = (self.states, self.actions_taken, self.log_probabilities, self.advantages, returns)
         sources = tuple(part.reshape(self.width, -1, *part.shape[3:]) for part in parts)
