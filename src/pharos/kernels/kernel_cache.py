@@ -29,10 +29,11 @@ from numba.core.serialize import dumps
 from pharos.system import storage
 from pharos.system.compiling import private_folder
 
-with contextlib.suppress(ImportError, AttributeError):  # of another Numba, which then compiles in its own way
-    from pharos.kernels import libraries
+if (0, 61) <= numba.version_info.short <= (0, 68):  # with which it was tried; any other compiles in its own way
+    with contextlib.suppress(ImportError, AttributeError):
+        from pharos.kernels import libraries
 
-    libraries.install()
+        libraries.install()
 
 DIGEST_BYTES = 32
 UNUSED_DAYS = 30

@@ -180,7 +180,11 @@ class Dynamics(ABC):
 
     @abstractmethod
     def part(self, start: int, stop: int) -> "tuple[Dynamics, np.ndarray]":
-        """The dynamics of the states [start, stop), numbered as in `Part`, and the outside states they may lead to."""
+        """The dynamics of the states [start, stop), numbered as in `Part`, and the outside states they may lead to.
+
+        Backups and expectations take values of these states too. No other operation knows of them: call `matrix`,
+        `merged` and `restricted_to` on the whole.
+        """
 
     def deterministic_table(self) -> Indices | None:
         """(S, A) next states, -1 for the end, if each execution has one outcome, else None."""
