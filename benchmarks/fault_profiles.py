@@ -63,7 +63,10 @@ def scores(agent, fault, number):
     suite, numbers = load_suite("v1"), {}
     protocol = suite.protocol
     for name in SCORED_TASKS:
-        learn, task = faults.make(agent, fault, **setting(agent, fault, number)), suite.task(name).check(protocol)
+        learn, task = (
+            faults.faulty_agent(agent, fault, **setting(agent, fault, number)),
+            suite.task(name).check(protocol),
+        )
         options = {"steps": protocol.steps, "evaluations": protocol.evaluations, "seed": 10 * number}
         with np.errstate(all="ignore"):
             rows = generated_curve(learn, task, **options).rows[1:]

@@ -17,7 +17,7 @@ import pharos
 from attacks.damage import NUMBERS, OTHERS, Attack, Tally, command, entry_changed, flipped, outcome
 from pharos import benchmark, exporters, hardness, importers, study
 from pharos.benchmark.profiles import SCORED_TASKS, SCORES
-from pharos.benchmark.results import FILE, WHAT
+from pharos.benchmark.results import RESULTS_FILE, RESULTS_KIND
 from pharos.benchmark.suite import FOLDER
 from pharos.mdp import TabularMDP
 from pharos.system.sealed import write_sealed
@@ -387,7 +387,7 @@ def finished(tmp_path_factory):
     record |= {"record": {**RECORD, "policies": facts, "failed": {"a": "why"}}}
     curves = {name: whole.curves[name][:3] for name in names}
     folder = tmp_path_factory.mktemp("finished")
-    write_sealed(folder / FILE, record, curves, WHAT)
+    write_sealed(folder / RESULTS_FILE, record, curves, RESULTS_KIND)
     return folder, record, curves
 
 
@@ -401,7 +401,7 @@ def diagnosed(folder):
 
 def test_results_that_are_diagnosed(finished, attack):
     folder, _, _ = finished
-    attack("results that are diagnosed", 12, folder, (FILE,), diagnosed)
+    attack("results that are diagnosed", 12, folder, (RESULTS_FILE,), diagnosed)
 
 
 def test_results_that_are_diagnosed_and_are_others(finished, tmp_path, count):
@@ -416,7 +416,10 @@ def test_results_that_are_diagnosed_and_are_others(finished, tmp_path, count):
 
     def sealed(**changes):
         write_sealed(
-            tmp_path / "r" / FILE, {**record, **changes.get("record", {})}, changes.get("curves", curves), WHAT
+            tmp_path / "r" / RESULTS_FILE,
+            {**record, **changes.get("record", {})},
+            changes.get("curves", curves),
+            RESULTS_KIND,
         )
 
     foreign = {
@@ -424,11 +427,11 @@ def test_results_that_are_diagnosed_and_are_others(finished, tmp_path, count):
         "a table": SCORES.read_bytes(),
         "numbers alone": safetensors.numpy.save(dict(curves)),
         "JSON": b"{}",
-        "half written": (folder / FILE).read_bytes()[: (folder / FILE).stat().st_size // 2],
-        "of a later version": (folder / FILE).read_bytes().replace(b'\\"format\\": 1', b'\\"format\\": 9'),
+        "half written": (folder / RESULTS_FILE).read_bytes()[: (folder / RESULTS_FILE).stat().st_size // 2],
+        "of a later version": (folder / RESULTS_FILE).read_bytes().replace(b'\\"format\\": 1', b'\\"format\\": 9'),
     }
     for name, data in foreign.items():
-        (tmp_path / "r" / FILE).write_bytes(data)
+        (tmp_path / "r" / RESULTS_FILE).write_bytes(data)
         tally.note(name, *outcome(read, ("refused alone",)))
     for name, suite in itertools.product(("suite", "suite_digest"), ("v2", "large", "../v1", "", "x" * 64)):
         sealed(record={name: suite})
