@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from pharos.environments.base import (
         CELL,
         CELLS,
+        NO_ACTION,
         VALUED_CELLS,
         Color,
         Components,

@@ -26,6 +26,8 @@ from pharos.system.wording import capped
 if TYPE_CHECKING:
     from pharos.system.distinct_rows import DistinctRows
 
+NO_ACTION = -1  # the previous action on the first step of an episode
+
 # Parameters -----------------------------------------------------------------------------------------------------------
 #
 # Declared in the fields of a dataclass, and checked when an instance is made:

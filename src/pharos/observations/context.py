@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from pharos.environments import NO_ACTION
 from pharos.errors import ParameterError
 from pharos.observations.observation import Observation
 from pharos.observations.vector import Vector
-from pharos.rules import NO_ACTION
 
 Seen = np.ndarray | dict[str, np.ndarray]  # one observation or a batch of them; a dict if there are several parts
 

@@ -6,7 +6,7 @@ Only names that load no Numba are imported at once, the others when they are ask
 from typing import TYPE_CHECKING
 
 from pharos.rules.compiler import fingerprint_of_rules, mentioned_names, mutable_attributes
-from pharos.rules.layout import NO_ACTION, Layout, layout_of, pack_states, unpack_states
+from pharos.rules.layout import Layout, layout_of, pack_states, unpack_states
 from pharos.system import lazy
 
 if TYPE_CHECKING:

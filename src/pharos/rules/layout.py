@@ -13,7 +13,6 @@ import numpy as np
 from pharos.environments import Components
 from pharos.errors import ParameterError
 
-NO_ACTION = -1  # the previous action on the first step of an episode
 AT_ONCE = 64
 """States for each component up to which all components are unpacked at once; of more, one after another."""
 

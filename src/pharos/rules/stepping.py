@@ -2,10 +2,9 @@
 
 import numpy as np
 
-from pharos.environments import Environment
+from pharos.environments import NO_ACTION, Environment
 from pharos.kernels import stepping
 from pharos.kernels.stepping import SAME_STEP
-from pharos.rules.layout import NO_ACTION
 
 
 class InterpretedStepping:
