@@ -471,7 +471,7 @@ def facts_of_the_second_test():
     hardest, easiest = (f"{name} by {number(abs(mean[name]))}" for name in (mean.index[-1], mean.index[0]))
     return [
         f"{len(states)} instances of {states.min()} to {states.max()} states, {len(done)} runs",
-        f"80 % intervals held {held[0]} of PPO's cells and {held[1]} of DQN's",
+        f"80 % intervals covered {held[0]} of PPO's cells and {held[1]} of DQN's",
         f"Cut alike, the rank correlation is {number(rank)}",
         f"too little for {hardest}, too much for {easiest}",
     ]

@@ -142,7 +142,7 @@ def test_updates_of_ppo_are_those_of_stable_baselines3(task, max_grad_norm):
     losses, buffer = losses_of(model), model.rollout_buffer
     lane.add_values_of_cut_episodes()
     rollouts.advantages(
-        lane.rewards, lane.kept_values, lane.begins, lane.values_of(lane.worlds.state), lane.begin > 0,
+        (lane.rewards, lane.kept_values, lane.begins), lane.values_of(lane.worlds.state), lane.begin > 0,
         lane.own["gamma"], lane.own["gae_lambda"], lane.advantages,
     )  # fmt: skip
     returns = lane.advantages + lane.kept_values
