@@ -371,17 +371,20 @@ def is_on_policy(numbers: Mapping[str, float], library: Sequence[Profile]) -> bo
     """Whether values are farther from their backup with the largest next value than those of any healthy agent, but
     not from their backup with the next actions as they were played: those of a learner on-policy, such as SARSA.
     """
-    limit = next(each for each in SYMPTOMS if each.reading == "consistency").limit(_healthy(library))
-    return numbers.get("on_policy", np.inf) <= limit < numbers.get("consistency", -np.inf)
+    return numbers.get("on_policy", np.inf) <= _farthest_healthy(library) < numbers.get("consistency", -np.inf)
 
 
 def has_no_memory(numbers: Mapping[str, float], library: Sequence[Profile]) -> bool:
     """Whether values are those of a learner on-policy without a memory, such as SARSA with a network: far from both
     backups, but nearer to that of what was played, by ON_POLICY_GAP, in states that it visited of late.
     """
-    limit = next(each for each in SYMPTOMS if each.reading == "consistency").limit(_healthy(library))
-    is_far = min(numbers.get(name, -np.inf) for name in ("on_policy", "consistency")) > limit
-    return is_far and numbers.get("on_policy_gap", np.inf) <= ON_POLICY_GAP
+    residual = min(numbers.get(name, -np.inf) for name in ("on_policy", "consistency"))
+    return residual > _farthest_healthy(library) and numbers.get("on_policy_gap", np.inf) <= ON_POLICY_GAP
+
+
+def _farthest_healthy(library: Sequence[Profile]) -> float:
+    """Largest `consistency` of healthy agents, with the margin of its symptom."""
+    return next(each for each in SYMPTOMS if each.reading == "consistency").limit(_healthy(library))
 
 
 def _healthy(library: Sequence[Profile]) -> list[Mapping[str, float]]:

@@ -6,7 +6,7 @@ command would go on to exit code 0. So:
 
 - While the command loads, the process ends at once (`pharos/__init__.py`): nothing has begun.
 - While it works, KeyboardInterrupt is raised, so that locks and processes end in order. Not within an import, whose end
-is awaited, and once more if it was lost.
+  is awaited, and once more if it was lost.
 - When it has ended, the line is printed, what `atexit` has to clean up is cleaned up, and the exit code becomes 130.
 """
 

@@ -6,7 +6,7 @@ Runs share what they can of their tasks. Nothing is trained here.
 """
 
 import json
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -131,8 +131,19 @@ def _run_shape(config: RunConfig, unknown: str) -> RunShape:
     return RunShape(shape, dtype, len(shape) == 3 and dtype == "uint8", observation.frames, *sizes)
 
 
+class _WithHyperparameters:
+    """A run, by its configuration, with all hyperparameters that are known, those of the configuration first."""
+
+    config: RunConfig
+
+    @cached_property
+    def hyperparameters(self) -> dict[str, Any]:
+        config = self.config
+        return hyperparameters_of(config.agent, config.environment, config.observation, config.hyperparameters)
+
+
 @dataclass(frozen=True)
-class _Sizes:
+class _Sizes(_WithHyperparameters):
     """A run as `Agent.group_key` takes it: a `PlannedRun`."""
 
     config: RunConfig
@@ -141,11 +152,6 @@ class _Sizes:
     @property
     def steps(self) -> int:
         return self.config.steps
-
-    @cached_property
-    def hyperparameters(self) -> Mapping[str, Any]:
-        config = self.config
-        return hyperparameters_of(config.agent, config.environment, config.observation, config.hyperparameters)
 
     @property
     def shape(self) -> RunShape:
@@ -218,7 +224,7 @@ class TaskCache:
 
 
 @dataclass(eq=False)
-class PreparedRun:
+class PreparedRun(_WithHyperparameters):
     """A run before and while it is trained: a `pharos.agents.LearningRun`, with its curve and its record.
 
     Attributes:
@@ -245,12 +251,6 @@ class PreparedRun:
     def is_alone(self) -> bool:
         """Whether it is the only run of its program."""
         return self.key is None
-
-    @cached_property
-    def hyperparameters(self) -> dict[str, Any]:
-        """All that are known, the configuration's first."""
-        config = self.config
-        return hyperparameters_of(config.agent, config.environment, config.observation, config.hyperparameters)
 
     @cached_property
     def curve(self) -> Curve:
