@@ -227,7 +227,7 @@ def test_slow_work_is_told_after_ten_seconds_and_ever_more_seldom(monkeypatch, c
     work.text = "diameter  between 3 and 9"
     lines = []
     for now[0] in map(float, range(300)):
-        work.tell_if_due()
+        work.report_if_due()
         if line := capsys.readouterr().err:
             lines.append((now[0], line))
     assert [seconds for seconds, _ in lines] == [10, 20, 40, 80, 140, 200, 260]

@@ -112,7 +112,7 @@ class SlowWork:
         self.what, self.text = what, ""
         self._clock, self._began, self._due = clock, clock(), SLOW_AFTER
 
-    def tell_if_due(self) -> None:
+    def report_if_due(self) -> None:
         """Write a line if the time for one has come."""
         seconds = self._clock() - self._began
         if seconds >= self._due:
@@ -126,7 +126,7 @@ class SlowWork:
 
         def watch() -> None:
             while not is_done.wait(1.0):
-                self.tell_if_due()
+                self.report_if_due()
 
         thread = threading.Thread(target=watch, daemon=True)
         thread.start()
