@@ -56,8 +56,10 @@ def test_a_run_is_the_same_alone_among_others_and_in_another_order(grid, agent):
 
 
 @pytest.mark.parametrize("agent", AGENTS)
-def test_a_run_is_the_same_in_lanes_of_every_width(grid, agent):
-    runs = runs_of(grid, AGENTS[agent], 12)
+@pytest.mark.parametrize("observation", ["vector", "simple_image"])
+def test_a_run_is_the_same_in_lanes_of_every_width(observation, agent):
+    task = Task.of(make("simple_grid"), sticky=0.2, random=0.1, observation=observation)
+    runs = runs_of(task, AGENTS[agent], 12)
     first = outcome(learned(agent, runs[:1]), 0)
     assert all(outcome(learned(agent, runs[:number]), 0) == first for number in (5, 7, 12))
 

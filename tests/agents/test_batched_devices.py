@@ -101,6 +101,32 @@ def test_convolutions_side_by_side_are_those_run_by_run(monkeypatch):
         assert (one - other).abs().max() <= 1e-4 * one.abs().max()
 
 
+@pytest.mark.parametrize("kind", ["convolution", "pictures"])
+def test_idle_runs_of_a_narrow_lane_have_no_convolutions_and_the_others_the_same(kind):
+    """On the processor two runs of four are computed to the bit as if all four were, the rest stays 0."""
+    generator = torch.Generator().manual_seed(1)
+    answers = []
+    for number in (None, 2):
+        parameters = networks.Parameters()
+        if kind == "pictures":
+            layer = networks.PictureLayers(parameters, "c", (1, 5, 4))
+        else:
+            layer = networks.ConvolutionLayer(parameters, "c", (2, 12, 12), 5, 4, 2, 1 / 255)
+        layer.number = number
+        if number is None:
+            rows = torch.randn(4, parameters.length, generator=generator)
+            pixels = networks.aligned_zeros(4, 3, layer.inputs)
+            pixels.copy_(255 * (torch.rand(pixels.shape, generator=generator) > 0.5))
+            dy = torch.randn(4, 3, layer.outputs, generator=generator)
+        gradients = torch.zeros_like(rows)
+        y = layer.forward(parameters.views(rows), pixels).clone()
+        layer.backward(parameters.views(rows), parameters.views(gradients), pixels, dy.clone(), onward=False)
+        answers.append((y, gradients))
+    for whole, part in zip(*answers, strict=True):
+        assert whole[2:].any() and torch.equal(whole[:2], part[:2])
+        assert not part[2:].any()
+
+
 def test_mirrors_are_one_array_on_the_processor_and_two_elsewhere():
     here, there = (PinnedBuffer((3,), torch.float32, device) for device in ("cpu", ELSEWHERE))
     for mirror, alike in ((here, True), (there, False)):

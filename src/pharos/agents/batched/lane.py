@@ -268,6 +268,8 @@ class Lane(Generic[Net]):
         self.seen = (ObservationTable if device == "cpu" else DeviceObservationTable)(self.runs, device)
         self._buffers: dict[int, torch.Tensor] = {}
         self.network = self.network_for(self.seen.shape)
+        for layer in self.network.layers:
+            layer.number = self.number
         self._own_networks = [
             self.network if view.shape == self.seen.shape else self.network_for(view.shape) for view in self.seen.views
         ]

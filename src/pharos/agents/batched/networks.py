@@ -103,10 +103,16 @@ def flat_view(y: Tensor) -> Tensor:
 
 
 class NetworkLayer:
-    """x (W, B, in) -> (W, B, out). Keeps its buffers for each number of rows, overwritten by the next call."""
+    """x (W, B, in) -> (W, B, out). Keeps its buffers for each number of rows, overwritten by the next call.
+
+    Attributes:
+        number: how many of the W networks are runs, None if all are. Idle ones after them fill a narrow lane. On the
+            processor no convolution is computed for them: there outputs and gradients are 0.
+    """
 
     def __init__(self, name: str, inputs: int, outputs: int, activation: str):
         self.name, self.inputs, self.outputs, self.activation = name, inputs, outputs, activation
+        self.number: int | None = None
         self._rooms: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
 
     def forward(self, values: Values, x: Tensor) -> Tensor:
@@ -263,7 +269,7 @@ class ConvolutionLayer(NetworkLayer):
         y, _ = self._buffers(x)
         weights, bias = values[f"{self.name}.weight"] * self.scale, values[f"{self.name}.bias"]
         if is_one_by_one(x):
-            for i in range(len(x)):
+            for i in range(len(x[: self.number])):
                 images = x[i].view(-1, *self.shape_in)
                 y[i] = torch.nn.functional.conv2d(images, weights[i], bias[i, 0], self.stride).flatten(1)
         else:
@@ -278,7 +284,7 @@ class ConvolutionLayer(NetworkLayer):
         y, dx = self._buffers(x, onward=onward)
         dy = self._before_activation(dy, y)
         if is_one_by_one(x):
-            for i in range(len(x)):
+            for i in range(len(x[: self.number])):
                 images, out = x[i].view(-1, *self.shape_in), dy[i].view(-1, *self.shape_out)
                 self._gradients(values, gradients, slice(i, i + 1), images, out, dx[i : i + 1] if onward else None)
         else:
@@ -338,15 +344,14 @@ class PictureLayers(NetworkLayer):
                 np.empty((width, pixels, number), np.int32),
             )
         memory, pictures = self._memories[width, number], flat_view(x).numpy()
-        patches.forward(
-            values[ALL_PARAMETERS].numpy(), self._offsets, self.shape, self.indices, pictures, y.numpy(), memory
-        )
+        rows = values[ALL_PARAMETERS].numpy()[: self.number]
+        patches.forward(rows, self._offsets, self.shape, self.indices, pictures, y.numpy(), memory)
         return y
 
     def backward(self, values: Values, gradients: Values, x: Tensor, dy: Tensor, *, onward: bool) -> None:
         """See `NetworkLayer`. There is no gradient of the input."""
         dy = self._before_activation(dy, self._buffers(x)[0])
-        rows, written = values[ALL_PARAMETERS].numpy(), gradients[ALL_PARAMETERS].numpy()
+        rows, written = values[ALL_PARAMETERS].numpy()[: self.number], gradients[ALL_PARAMETERS].numpy()
         memory, pictures = self._memories[x.shape[0], x.shape[1]], flat_view(x).numpy()
         patches.backward(rows, written, self._offsets, self.shape, self.indices, pictures, dy.numpy(), memory)
 
@@ -458,11 +463,12 @@ class BatchedNetwork(Protocol):
     """W networks of one shape, the interface to a lane.
 
     Attributes:
-        parameters: their positions. eps: of Adam.
+        parameters: their positions. eps: of Adam. layers: all of them.
     """
 
     parameters: Parameters
     eps: float
+    layers: list[NetworkLayer]
 
     def scores(self, values: Values, x: Tensor) -> Tensor:
         """(W, B, A) scores of actions in observations (W, B, size)."""
@@ -488,7 +494,8 @@ class QNetworks:
         last = LinearLayer(
             parameters, f"q_net.q_net.{2 * len(sizes)}", [FEATURES, *sizes][-1], num_actions, NO_ACTIVATION
         )
-        self.stack = Stack([*layers, last])
+        self.layers = [*layers, last]
+        self.stack = Stack(self.layers)
 
     def scores(self, values: Values, x: Tensor) -> Tensor:
         """(W, B, A) values of actions in observations (W, B, size)."""
@@ -523,6 +530,7 @@ class ActorCritics:
         actor_layers.append(LinearLayer(parameters, "action_net", [FEATURES, *actor][-1], num_actions, NO_ACTIVATION))
         critic_layers.append(LinearLayer(parameters, "value_net", [FEATURES, *critic][-1], 1, NO_ACTIVATION))
         self.actor, self.critic = Stack(actor_layers), Stack(critic_layers)
+        self.layers = [*self.trunk.layers, *actor_layers, *critic_layers]
 
     def both(self, values: Values, x: Tensor) -> tuple[Tensor, Tensor]:
         """(W, B, A) scores, whose softmax is the policy, and (W, B, 1) values."""
