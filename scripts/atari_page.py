@@ -99,7 +99,7 @@ RUNS = "| game | agent | seeds | predicted, and its interval | observed: mean, l
 def write_runs(folder: Path) -> None:
     """runs.csv of the study, one row a finished run, and its table on the page."""
     rows = []
-    for file in sorted(folder.glob("*/run.json")):
+    for file in sorted(folder.rglob("run.json")):
         record = json.loads(file.read_text())
         if record["status"] == "finished":
             config, result = record["config"], record["result"]
