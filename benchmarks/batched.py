@@ -79,9 +79,9 @@ def work(agent: str, options: dict, lane) -> float:
     Of small images, too, whose equal patches the engine computes once.
     """
     forward = first = 0.0
-    for each in lane.network.parameters.shapes:
+    for each in lane.networks.network.parameters.shapes:
         if each.name.endswith("weight"):
-            pixels = math.prod(lane.seen.shape[1:]) if "layers.0.0" in each.name else 1
+            pixels = math.prod(lane.inputs.table.shape[1:]) if "layers.0.0" in each.name else 1
             forward += 2 * each.size * pixels
             first = first or forward
     if agent == "ppo":

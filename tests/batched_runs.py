@@ -45,10 +45,11 @@ def updates_of(lane, names, monkeypatch):
 
 def drawn_rows(lane, size, rows):
     """(rows of the memory, copies of the environment) that a minibatch draws, with the numbers of step 7."""
-    words = np.zeros((lane.width, size, 4), np.uint32)
-    batched.words(lane.keys, batched.SAMPLE, 7, words)
+    words = np.zeros((lane.group.width, size, 4), np.uint32)
+    batched.words(lane.group.keys, batched.SAMPLE, 7, words)
     return tuple(
-        ((words[RUN, :, k].astype(np.uint64) * n) >> 32).astype(np.int64) for k, n in ((0, rows), (1, lane.copies))
+        ((words[RUN, :, k].astype(np.uint64) * n) >> 32).astype(np.int64)
+        for k, n in ((0, rows), (1, lane.group.copies))
     )
 
 

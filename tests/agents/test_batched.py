@@ -115,7 +115,7 @@ def test_tensor_operations_compute_what_the_compiled_loops_do(grid, agent):
     """What runs on other devices, here on the processor."""
     runs = runs_of(grid, AGENTS[agent])
     compiled, tensors = (make_batch(agent, runs) for _ in range(2))
-    tensors.lanes[0].arithmetic = TensorArithmetic("cpu", tensors.lanes[0].width)
+    tensors.lanes[0].networks.arithmetic = TensorArithmetic("cpu", tensors.lanes[0].group.width)
     for batch in (compiled, tensors):
         batch.learn([60], lambda point: None)
     for i in range(3):
@@ -128,7 +128,7 @@ def test_networks_are_on_the_device_that_is_asked_for(grid, agent):
     other, usual = (learned(agent, runs_of(grid, AGENTS[agent], 1), [60], device=name) for name in ("cpu:0", "cpu"))
     (lane,) = other.lanes
     assert lane.device == "cpu:0"
-    assert isinstance(lane.arithmetic, TensorArithmetic)
+    assert isinstance(lane.networks.arithmetic, TensorArithmetic)
     assert difference(other.parameters(0), usual.parameters(0)) <= 1e-5
 
 

@@ -42,8 +42,8 @@ def assert_same_parameters(model, parameters):
 
 def clipped(lane, i, max_norm):
     """The gradients of a run as Adam gets them, by name."""
-    scale = min(1.0, max_norm / (float(lane.gradients[i].norm()) + 1e-6))
-    return {name: value * scale for name, value in lane.as_stored(lane.gradient_views, i).items()}
+    scale = min(1.0, max_norm / (float(lane.networks.gradients[i].norm()) + 1e-6))
+    return {name: value * scale for name, value in lane.networks.as_stored(lane.networks.gradient_views, i).items()}
 
 
 def as_stored(observations):
@@ -82,7 +82,7 @@ def check_updates_of_dqn(task, hyperparameters, number):
     batch.learn([60], lambda point: None)
     lane, i = batch.lanes[0], 1
     for name in ("means", "squares", "updates"):  # Adam begins anew, as in a fresh model
-        getattr(lane, name)[:] = 0
+        getattr(lane.networks, name)[:] = 0
     model = model_of("dqn", task, hyperparameters)
     load(model, batch.parameters(i))
     losses = losses_of(model)
@@ -97,7 +97,7 @@ def check_updates_of_dqn(task, hyperparameters, number):
 
     model.replay_buffer.sample = minibatch
     for update in range(number):
-        lane.replay.sample(60, update, lane.own["gamma"], 1)
+        lane.replay.sample(60, update, lane.group.own["gamma"], 1)
         lane.learn_minibatch()
         model.train(1, hyperparameters["batch_size"])
         assert abs(losses[-1] - lane.losses[i]) <= 1e-6
@@ -143,11 +143,11 @@ def test_updates_of_ppo_are_those_of_stable_baselines3(task, max_grad_norm):
     lane.add_values_of_cut_episodes()
     rollouts.advantages(
         (lane.rewards, lane.kept_values, lane.begins), lane.values_of(lane.worlds.state), lane.begin > 0,
-        lane.own["gamma"], lane.own["gae_lambda"], lane.advantages,
+        lane.group.own["gamma"], lane.group.own["gae_lambda"], lane.advantages,
     )  # fmt: skip
     returns = lane.advantages + lane.kept_values
     parts = [lane.states, lane.actions_taken, lane.log_probabilities, lane.advantages, returns]
-    sources = [part.reshape(lane.width, -1) for part in parts]
+    sources = [part.reshape(lane.group.width, -1) for part in parts]
     rng = np.random.default_rng(0)
     minibatches = [rng.permutation(24)[:12] for _ in range(6)]
 
@@ -163,7 +163,7 @@ def test_updates_of_ppo_are_those_of_stable_baselines3(task, max_grad_norm):
     model.n_epochs = 1
     model.train()
     for rows in minibatches:
-        lane.learn_minibatch(tuple(part[:, rows].copy() for part in sources), ~lane.is_idle)
+        lane.learn_minibatch(tuple(part[:, rows].copy() for part in sources), ~lane.group.is_idle)
     assert abs(losses[-1] - lane.losses[i]) <= 1e-6
     gradients = clipped(lane, i, max_grad_norm)
     for name, parameter in model.policy.named_parameters():

@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from batched_runs import difference, learned, runs_of
-from pharos.agents.batched import arithmetic, group_key, make_batch, networks
-from pharos.agents.batched import lane as lanes
+from pharos.agents.batched import arithmetic, group_key, inputs, make_batch, networks
 from pharos.agents.batched.arithmetic import CudaGraph, PinnedBuffer
 from pharos.environments import make
 from pharos.errors import ParameterError
@@ -41,7 +40,7 @@ def test_runs_that_see_more_or_less_share_a_lane_and_learn_what_they_learn_alone
     runs = grids(agent, observation, (4, 6))
     batch = learned(agent, runs, device=ELSEWHERE)
     (lane,) = batch.lanes
-    assert len({view.shape for view in lane.seen.views}) == 2
+    assert len({view.shape for view in lane.inputs.table.views}) == 2
     for first in (0, 2):
         alone = learned(agent, runs[first : first + 2])
         for i in (0, 1):
@@ -59,7 +58,7 @@ def test_what_a_run_has_not_stays_zero():
     """Weights of inputs that only the others of a lane have."""
     batch = learned("dqn", grids("dqn", "simple_image", (4, 6)), device=ELSEWHERE)
     (lane,) = batch.lanes
-    weights = lane.values["q_net.features_extractor.layers.1.weight"]
+    weights = lane.networks.values["q_net.features_extractor.layers.1.weight"]
     assert weights.shape[1] == 36 * 16
     assert not weights[:2, 16 * 16 :].any() and weights[2:4, 16 * 16 :].any()
 
@@ -189,7 +188,7 @@ def test_a_program_that_cannot_be_recorded_is_run_as_it_is(recorder):
 
 
 def test_observations_that_do_not_fit_on_the_device_are_counted(monkeypatch):
-    monkeypatch.setattr(lanes, "is_gpu", lambda device: True)
+    monkeypatch.setattr(inputs, "is_gpu", lambda device: True)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda: (1 << 12, 1 << 30))
     with pytest.raises(MemoryError, match="of 52 states take 0 MiB on cpu:0, more than 50%"):
         make_batch("dqn", grids("dqn", "simple_image", (4, 6), 1), device=ELSEWHERE)

@@ -26,7 +26,7 @@ from batched_runs import (
 )
 from pharos.agents import make_model
 from pharos.agents.batched import ObservationSource, group_key, make_batch
-from pharos.agents.batched import lane as lanes
+from pharos.agents.batched import inputs as network_inputs
 from pharos.errors import ParameterError
 from pharos.interaction import make_sb3_vec
 from pharos.kernels import batched
@@ -81,7 +81,7 @@ def recorded(agent, task, hyperparameters, steps):
         flags.update(lane.worlds.flags[RUN].tolist())
 
     lane.execute_actions = record
-    env = make_sb3_vec(task.env, lane.copies, seed=0, **task.interaction)
+    env = make_sb3_vec(task.env, lane.group.copies, seed=0, **task.interaction)
     return lane, Scripted(env, script), flags
 
 
@@ -110,17 +110,17 @@ def test_dqn_learns_from_the_frames_that_stable_baselines3_keeps(sight, n_steps,
     assert set(memory.memory[4][RUN].ravel().tolist()) == flags
 
     size, place = 400, lane.calls % memory.rows
-    states, nexts = (np.zeros((lane.width, size, frames), np.int64) for _ in range(2))
-    actions = np.zeros((lane.width, size), np.int64)
-    rewards, factors = (np.zeros((lane.width, size), np.float32) for _ in range(2))
+    states, nexts = (np.zeros((lane.group.width, size, frames), np.int64) for _ in range(2))
+    actions = np.zeros((lane.group.width, size), np.int64)
+    rewards, factors = (np.zeros((lane.group.width, size), np.float32) for _ in range(2))
     batch = (states, nexts, actions, rewards, factors)
-    gammas = lane.own["gamma"]
-    batched.sample_histories(lane.keys, (7, 0), (place, memory.size), gammas, n_steps, memory.memory, batch)
+    gammas = lane.group.own["gamma"]
+    batched.sample_histories(lane.group.keys, (7, 0), (place, memory.size), gammas, n_steps, memory.memory, batch)
     rows, copies = drawn_rows(lane, size, memory.size)
     assert set(rows.tolist()) == set(range(memory.size)), "all of the memory is among them"
     monkeypatch.setattr(np.random, "randint", lambda *_, **__: copies)
     theirs = buffer._get_samples((lane.calls - memory.size + rows) % memory.size)
-    source = lane.runs[RUN].observe
+    source = lane.group.runs[RUN].observe
     for mine, their in ((states, theirs.observations), (nexts, theirs.next_observations)):
         assert (channels_first(source.at(mine[RUN]), their.shape[1:]) == their.numpy()).all()
     assert np.abs(rewards[RUN] - theirs.rewards.numpy()[:, 0]).max() <= 1e-6
@@ -145,7 +145,7 @@ def test_ppo_gathers_the_frames_and_values_that_stable_baselines3_gathers(sight,
     monkeypatch.setattr(model, "train", lambda: theirs.append({name: getattr(buffer, name).copy() for name in kept}))
     model.learn(total)
     assert len(ours) == len(theirs) == 4
-    source = lane.runs[RUN].observe
+    source = lane.group.runs[RUN].observe
     for mine, their in zip(ours, theirs, strict=True):
         steps, copies, *shape = their["observations"].shape
         seen = source.at(mine["states"].reshape(steps * copies, -1))
@@ -166,7 +166,7 @@ def test_a_run_with_frames_is_the_same_alone_among_others_and_drawn(agent, monke
     assert outcome(together, 5) == alone
     assert all(outcome(together, i) == outcome(backwards, 10 - i) for i in range(11))
     assert len({outcome(together, i) for i in range(11)}) == 11
-    monkeypatch.setattr(lanes, "OBSERVED_BYTES", 0)
+    monkeypatch.setattr(network_inputs, "OBSERVED_BYTES", 0)
     assert outcome(learned(agent, runs[5:6]), 0) == alone
 
 
@@ -204,14 +204,15 @@ def test_what_is_looked_up_is_what_is_drawn(sight, monkeypatch):
     task = task_of(sight)
     runs = runs_of(task, DQN_OPTIONS, 1)
     in_table, drawn = make_batch("dqn", runs).lanes[0], None
-    monkeypatch.setattr(lanes, "OBSERVED_BYTES", 0)
+    monkeypatch.setattr(network_inputs, "OBSERVED_BYTES", 0)
     drawn = make_batch("dqn", runs).lanes[0]
-    assert in_table.seen._table is not None and drawn.seen._table is None
-    histories = np.random.default_rng(0).integers(0, task.space.num_states, (in_table.width, 7, *in_table.depth))
+    assert in_table.inputs.table._table is not None and drawn.inputs.table._table is None
+    shape = (in_table.group.width, 7, *in_table.inputs.depth)
+    histories = np.random.default_rng(0).integers(0, task.space.num_states, shape)
     states = SimpleNamespace(array=histories)
-    assert torch.equal(in_table.observed(states), drawn.observed(states))
-    seen = drawn.seen.encoded(runs[0].observe.at(histories[0]), 0)
-    assert torch.equal(in_table.observed(states)[0], seen)
+    assert torch.equal(in_table.inputs.observed(states), drawn.inputs.observed(states))
+    seen = drawn.inputs.table.encoded(runs[0].observe.at(histories[0]), 0)
+    assert torch.equal(in_table.inputs.observed(states)[0], seen)
 
 
 # What policies are worth, and runs ------------------------------------------------------------------------------------

@@ -166,10 +166,11 @@ def assert_same_memory(lane, model):
 def assert_same_minibatch(lane, model, monkeypatch):
     """The same rows and copies of both memories: returns of n steps, the states they end in, what follows is worth."""
     memory, size, filled = lane.replay, 500, min(lane.calls, lane.replay.size)
-    states, nexts, actions = (np.zeros((lane.width, size), np.int64) for _ in range(3))
-    rewards, factors = (np.zeros((lane.width, size), np.float32) for _ in range(2))
-    batch, place, steps = (states, nexts, actions, rewards, factors), lane.calls % memory.size, lane.shared["n_steps"]
-    batched.sample(lane.keys, (7, 0), (place, filled), lane.own["gamma"], int(steps), memory.memory, batch)
+    states, nexts, actions = (np.zeros((lane.group.width, size), np.int64) for _ in range(3))
+    rewards, factors = (np.zeros((lane.group.width, size), np.float32) for _ in range(2))
+    batch, place = (states, nexts, actions, rewards, factors), lane.calls % memory.size
+    steps = lane.group.shared["n_steps"]
+    batched.sample(lane.group.keys, (7, 0), (place, filled), lane.group.own["gamma"], int(steps), memory.memory, batch)
     rows, copies = drawn_rows(lane, size, filled)
     assert {place, (place - 1) % filled} & set(rows.tolist()), "the ends of the memory are among them"
     monkeypatch.setattr(np.random, "randint", lambda *_, **__: copies)

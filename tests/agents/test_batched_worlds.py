@@ -5,8 +5,7 @@ import pytest
 from scipy.stats import kstest
 
 from batched_runs import learned, outcome, runs_of
-from pharos.agents.batched import BatchRun, ObservationSource
-from pharos.agents.batched import lane as lanes
+from pharos.agents.batched import BatchRun, ObservationSource, inputs
 from pharos.agents.batched.lane import BatchedEpisodes
 from pharos.environments import make
 from pharos.interaction.simulator import RewardChannel
@@ -87,7 +86,7 @@ def test_what_is_executed_is_in_the_sets_and_as_likely_as_it_should_be():
     both = [random_actions(sticky_actions(mdp, 0.3), 0.2) for mdp in (some, free)]
     runs = [run for mdp in both for run in runs_on(mdp, 20)]
     keys = np.array([run.key for run in runs], np.uint64)
-    worlds, alone = BatchedEpisodes(runs, keys, 4, 1, lanes.ActionSets.of(runs, "cpu")), BatchedEpisodes(runs, keys, 4)
+    worlds, alone = BatchedEpisodes(runs, keys, 4, 1, inputs.ActionSets.of(runs, "cpu")), BatchedEpisodes(runs, keys, 4)
     rng, counts = np.random.default_rng(2), {}
     for step in range(300):
         state, previous = worlds.state.copy(), worlds.previous.copy()
@@ -202,5 +201,5 @@ def test_observations_that_fit_no_table_change_nothing(monkeypatch, observation)
     task = Task.of(make("frozen_lake/4x4"), observation=observation)
     runs = runs_of(task, DQN, 2, 60)
     in_table = outcomes(runs)
-    monkeypatch.setattr(lanes, "OBSERVED_BYTES", 0)
+    monkeypatch.setattr(inputs, "OBSERVED_BYTES", 0)
     assert in_table == outcomes(runs)

@@ -64,8 +64,8 @@ def test_one_seed_gives_one_game_in_every_engine(name, chance, spaces):
     env, space = WORLDS[name], spaces[name]
     options = {"time_limit": 6, **chance}
     single, interpreted = GymEnv(env, space=space, **options), GymEnv(env, **options)
-    interpreted._step_one = InterpretedStepping(env).step_one
-    interpreted._outcome_one = InterpretedStepping(env).outcome_one
+    interpreted._compiled.step_one = InterpretedStepping(env).step_one
+    interpreted._chance.outcome_one = InterpretedStepping(env).outcome_one
     many, table, twin = (make_vec(env, 1, space=each, **options) for each in (None, space, None))
     twin._stepper._step_many = InterpretedStepping(env).step_many
     actions = np.random.default_rng(1).integers(env.num_actions, size=300).tolist()

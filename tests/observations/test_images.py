@@ -186,7 +186,7 @@ def test_a_copy_in_another_process_compiles_nothing_anew(tmp_path):
         "import pickle, sys\n"
         f"env = pickle.load(open({str(tmp_path / 'env')!r}, 'rb'))\n"
         "env.step(0)\n"
-        "kernels = env._step_one, env._step_and_draw\n"
+        "kernels = env._compiled.step_one, env._compiled.draws\n"
         "print(sum(sum(kernel.stats.cache_misses.values()) for kernel in kernels))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

@@ -7,6 +7,7 @@ needs to be built.
 
 import operator
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, SupportsIndex
 
 import gymnasium
@@ -23,6 +24,110 @@ if TYPE_CHECKING:
 
 
 _ONE = np.ones(1, np.bool_)
+
+
+@dataclass
+class Episode:
+    """The episode that is played.
+
+    Attributes:
+        spare: (D,) room for the next state. state: (D,), None before the first episode. index: of the state, if a state
+            space was given.
+        previous: the last executed action. elapsed: steps so far. terminated: whether the state is terminal.
+    """
+
+    spare: np.ndarray
+    state: np.ndarray | None = None
+    index: int = -1
+    previous: int = NO_ACTION
+    elapsed: int = 0
+    terminated: bool = False
+
+
+class CompiledStep:
+    """The compiled step of the rules, which writes the observation, too, if that is a vector or a simple image.
+
+    Attributes:
+        writes: whether it does. starts: then the observations of the start states, if these are few.
+        step_one, draws: see `rules.stepping`. draws: None unless a simple image is written.
+    """
+
+    def __init__(self, simulator: Simulator):
+        self._simulator, context = simulator, simulator.context
+        self._parameters, self._ranges = simulator.rules.parameters, simulator.ranges
+        self._compile()
+        vector, observation = context.vector if context.is_plain else None, context.observation
+        self.writes = vector is not None or self.draws is not None
+        few = self.writes and len(simulator.start_states) <= 4096
+        self.starts: np.ndarray | None = observation(simulator.start_states) if few else None
+        self._blank: np.ndarray = np.zeros(0 if vector is None else len(simulator.env.components), np.float32)
+        self._numbers = np.zeros(0) if vector is None else vector.scale  # or shades of an image
+        if self.draws is not None:
+            self._blank, self._numbers = np.zeros(observation.space.shape or (), np.uint8), observation.shades
+
+    def step(self, state: np.ndarray, branch: int, next_state: np.ndarray) -> tuple[float, int, np.ndarray]:
+        """(reward, code, observation): code 1 is a terminal state, above 1 a fault. Writes `next_state`."""
+        written = self._blank.copy()
+        if self.draws is None:
+            reward, code = self.step_one(
+                self._parameters, self._ranges, self._numbers, state, branch, next_state, written
+            )
+        else:
+            reward, code = self.draws(self._parameters, self._ranges, state, branch, next_state, self._numbers, written)
+        return reward, code, written
+
+    def _compile(self) -> None:
+        self.step_one, self.draws = self._simulator.rules.step_one, _step_and_draw(self._simulator)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """State without compiled functions: the process of the copy takes them from the cache, without compiling."""
+        return {**self.__dict__, "step_one": None, "draws": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self._compile()
+
+
+class StepChance:
+    """What is drawn in a step: the executed action, whether it has an effect, and an outcome of the rules.
+
+    Attributes:
+        is_none: whether nothing is drawn.
+        stream: of random numbers, if the rules have chance. None: of the environment.
+    """
+
+    def __init__(self, simulator: Simulator):
+        self._simulator, self._parameters = simulator, simulator.rules.parameters
+        self._has_chance, self._has_one_branch = simulator.has_chance, not (simulator.lazy or simulator.has_outcomes)
+        self._stays, self._lazy, self._has_sets = simulator.chance[0], simulator.lazy, simulator.has_sets
+        self._num_outcomes, self.outcome_one = int(simulator.env.outcomes), simulator.rules.outcome_one
+        self.is_none = self._has_one_branch and not self._has_chance
+        self.stream: Stream | None = None
+
+    def drawn(
+        self, numbers: np.random.Generator | Stream, state: np.ndarray, action: int, previous: int
+    ) -> tuple[int, int, float]:
+        """(executed action, branch of the rules, probability of the outcome). A negative branch is a lazy step."""
+        executed = action
+        if self._has_chance:
+            u, mask = numbers.random(), self._simulator.action_masks(state[None])[0] if self._has_sets else None
+            if u >= self._stays or mask is not None:
+                executed = self._simulator.executed(action, previous, u, mask)
+        if self._has_one_branch:
+            return executed, executed, 1.0
+        if self._lazy and numbers.random() < self._lazy:
+            return executed, -1 - executed, self._lazy
+        if self.stream is None:
+            return executed, executed, 1.0
+        outcome, probability = self.outcome_one(self._parameters, state, executed, numbers.random())
+        return executed, executed * self._num_outcomes + outcome, probability * (1.0 - self._lazy)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "outcome_one": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        self.outcome_one = self._simulator.rules.outcome_one
 
 
 class GymEnv(SimulatedEnv, gymnasium.Env):
@@ -62,47 +167,16 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         self.observation_space = simulator.context.space
         self.action_space = gymnasium.spaces.Discrete(simulator.env.num_actions)
         self.action_names = simulator.env.actions
-        self._state: np.ndarray | None = None
-        self._index = -1
-        self._previous = NO_ACTION
-        self._elapsed = 0
-        self._terminated = False
-        # What a step needs, without a chain of attributes
-        self._step_one, self._parameters = simulator.rules.step_one, simulator.rules.parameters
-        self._ranges, self._num_actions = simulator.ranges, simulator.env.num_actions
+        self._episode = Episode(simulator.start_states[0].copy())
+        self._compiled, self._chance = CompiledStep(simulator), StepChance(simulator)
+        self._num_actions = simulator.env.num_actions
         self._limit = simulator.limit if simulator.limit is not None else 1 << 62
-        observation = simulator.context.observation
-        vector = simulator.context.vector if simulator.context.is_plain else None
-        is_vector = vector is not None
-        self._spare = simulator.start_states[0].copy()  # room for the next state
-        self._blank: np.ndarray = np.zeros(len(simulator.env.components) if is_vector else 0, np.float32)
-        self._scale = np.zeros(0) if vector is None else vector.scale
-        self._step_and_draw = _step_and_draw(simulator)
-        self._is_written = is_vector or self._step_and_draw is not None  # whether a step writes the observation itself
-        few = self._is_written and len(simulator.start_states) <= 4096
-        self._start_observations = observation(simulator.start_states) if few else None
-        if self._step_and_draw is not None:
-            self._shades, self._blank = observation.shades, np.zeros(observation.space.shape or (), np.uint8)
-        self._has_chance, self._stays, self._lazy = simulator.has_chance, simulator.chance[0], simulator.lazy
-        self._has_outcomes, self._num_outcomes = simulator.has_outcomes, int(simulator.env.outcomes)
-        self._outcome_one, self._has_sets = simulator.rules.outcome_one, simulator.has_sets
-        self._stream: Stream | None = None  # of random numbers, if the rules have chance
-        self._is_index = simulator.context.is_plain and isinstance(observation, Index)
+        self._is_index = simulator.context.is_plain and isinstance(simulator.context.observation, Index)
         self._frame_stack = FrameStack(simulator, 1) if simulator.context.has_more else None
         self._last: Seen | None = None  # the observation, if it is more than a function of the state
         self._reward_channel = RewardChannel(interaction.chance, 1) if simulator.modifies_rewards else None
         space = simulator.state_space
-        self._successors = None if space is None or self._has_outcomes else space.successors
-
-    def __getstate__(self) -> dict[str, Any]:
-        """State without compiled functions: the process of the copy takes them from the cache, without compiling."""
-        return {**self.__dict__, "_step_one": None, "_outcome_one": None, "_step_and_draw": None}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        rules = self.simulator.rules
-        self._step_one, self._outcome_one = rules.step_one, rules.outcome_one
-        self._step_and_draw = _step_and_draw(self.simulator)
+        self._successors = None if space is None or simulator.has_outcomes else space.successors
 
     @property
     def state(self) -> tuple[int, ...]:
@@ -116,99 +190,79 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode. `options={"state": ...}` is the start state (D integers)."""
         super().reset(seed=seed)
-        simulator = self.simulator
+        simulator, episode, chance = self.simulator, self._episode, self._chance
         if self._reward_channel is not None:
             self._reward_channel.seed([seed])
             self._reward_channel.restart(_ONE)
         if self._frame_stack is not None:
             self._frame_stack.seed([seed])
-        if self._has_outcomes and (seed is not None or self._stream is None):
-            self._stream = Stream(int(self.np_random.integers(1 << 63)) if seed is None else seed)
+        if simulator.has_outcomes and (seed is not None or chance.stream is None):
+            chance.stream = Stream(int(self.np_random.integers(1 << 63)) if seed is None else seed)
         if options is not None and options.get("state") is not None:
-            self._state = simulator.checked_state(options["state"])
-            self._terminated = simulator.rules.is_terminal_one(self._parameters, self._state)
+            state = simulator.checked_state(options["state"])
+            episode.terminated = simulator.rules.is_terminal_one(simulator.rules.parameters, state)
             observation = None
         else:
-            start = simulator.drawn_start(self._stream or self.np_random)
-            self._state = simulator.start_states[start].copy()
-            self._terminated = False
-            observation = None if self._start_observations is None else self._start_observations[start].copy()
-        self._previous = simulator.first_previous
-        self._elapsed = 0
+            start = simulator.drawn_start(chance.stream or self.np_random)
+            state, episode.terminated = simulator.start_states[start].copy(), False
+            observation = None if self._compiled.starts is None else self._compiled.starts[start].copy()
+        episode.state, episode.previous, episode.elapsed = state, simulator.first_previous, 0
         if simulator.state_space is not None:
-            self._index = self._index_of(self._state)
+            episode.index = self._index_of(state)
         if self._window is not None:
             self.render()
         if observation is None or self._frame_stack is not None:
             observation = self._observation(begins=True)
-        return observation, self._info(self._state)
+        return observation, self._info(state)
 
     def step(self, action: SupportsIndex) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Choose an action. After a terminal state nothing changes and the reward is 0."""
-        executed = operator.index(action)
+        executed, simulator, episode = operator.index(action), self.simulator, self._episode
         if not 0 <= executed < self._num_actions:
             raise ParameterError(f"{self.environment}: action {action!r}; expected 0 to {self._num_actions - 1}")
-        state = self._state
-        if state is None or self._terminated:
+        state = episode.state
+        if state is None or episode.terminated:
             return self._step_after_the_end()
-        # Executed action: sticky and random actions
-        if self._has_chance:
-            u, mask = (self._stream or self.np_random).random(), self.action_masks() if self._has_sets else None
-            if u >= self._stays or mask is not None:
-                executed = self.simulator.executed(executed, self._previous, u, mask)
-        # Outcome of the executed action; a negative branch is a lazy step
         branch, probability = executed, 1.0
-        if self._lazy and (self._stream or self.np_random).random() < self._lazy:
-            branch, probability = -1 - executed, self._lazy
-        elif self._stream is not None:
-            outcome, probability = self._outcome_one(self._parameters, state, executed, self._stream.random())
-            branch, probability = executed * self._num_outcomes + outcome, probability * (1.0 - self._lazy)
-        # Next state, reward and observation in one compiled call; code 1 is a terminal state, above 1 a fault
-        next_state = self._spare
-        written = self._blank.copy()
-        if self._step_and_draw is not None:
-            reward, code = self._step_and_draw(
-                self._parameters, self._ranges, state, branch, next_state, self._shades, written
-            )
-        else:
-            reward, code = self._step_one(
-                self._parameters, self._ranges, self._scale, state, branch, next_state, written
-            )
+        if not self._chance.is_none:
+            numbers = self._chance.stream or self.np_random
+            executed, branch, probability = self._chance.drawn(numbers, state, executed, episode.previous)
+        next_state = episode.spare
+        reward, code, written = self._compiled.step(state, branch, next_state)
         if code:
             if code > 1:
-                self.simulator.raise_fault(state, executed, code - 2)
-            self._terminated = True
-        self._state, self._spare = next_state, state
-        self._previous = executed
-        self._elapsed += 1
+                simulator.raise_fault(state, executed, code - 2)
+            episode.terminated = True
+        episode.state, episode.spare, episode.previous = next_state, state, executed
+        episode.elapsed += 1
         # Infos, and delay and noise of the reward
         info: dict[str, Any] = {"state": next_state.copy(), "executed_action": executed}
-        if self._has_sets:
+        if simulator.has_sets:
             info["action_mask"] = self.action_masks().astype(np.int8)
         if self._successors is not None:
             if branch >= 0:
-                self._index = int(self._successors[self._index, executed])
-            info["index"] = self._index
-        if self._has_outcomes:
+                episode.index = int(self._successors[episode.index, executed])
+            info["index"] = episode.index
+        if simulator.has_outcomes:
             info["prob"] = probability
-            if self.simulator.state_space is not None:
-                info["index"] = self._index = self._index_of(next_state)
-        observation = written if self._is_written else self._observation()
+            if simulator.state_space is not None:
+                info["index"] = episode.index = self._index_of(next_state)
+        observation = written if self._compiled.writes else self._observation()
         if self._window is not None:
             self.render()
-        is_truncated = self._elapsed >= self._limit
+        is_truncated = episode.elapsed >= self._limit
         if self._reward_channel is not None:
             info["earned_reward"] = reward
-            ended = np.array([self._terminated or is_truncated])
+            ended = np.array([episode.terminated or is_truncated])
             reward = float(self._reward_channel.pay(np.array([reward]), _ONE, ended)[0])
-        return observation, reward, self._terminated, is_truncated, info
+        return observation, reward, episode.terminated, is_truncated, info
 
     def _step_after_the_end(self) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         state = self._started()
-        self._elapsed += 1
+        self._episode.elapsed += 1
         info = self._info(state)
         observation = self._observation() if self._last is None else self._last
-        return observation, 0.0, True, self._elapsed >= self._limit, info
+        return observation, 0.0, True, self._episode.elapsed >= self._limit, info
 
     def render(self) -> str | np.ndarray | None:
         """The current state in the render mode: text, a picture, or None if there is a window."""
@@ -231,11 +285,11 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
 
     def _info(self, state: np.ndarray) -> dict[str, Any]:
         info: dict[str, Any] = {"state": state.copy(), "executed_action": NO_ACTION}
-        if self._has_sets:
+        if self.simulator.has_sets:
             info["action_mask"] = self.action_masks().astype(np.int8)
         if self.simulator.state_space is not None:
-            info["index"] = self._index
-        if self._has_outcomes:
+            info["index"] = self._episode.index
+        if self.simulator.has_outcomes:
             info["prob"] = 1.0
         if self._reward_channel is not None:
             info["earned_reward"] = 0.0
@@ -246,20 +300,21 @@ class GymEnv(SimulatedEnv, gymnasium.Env):
         return int(self.simulator.state_space.indices(state[None])[0])
 
     def _started(self) -> np.ndarray:
-        if self._state is None:
+        if self._episode.state is None:
             raise gymnasium.error.ResetNeeded(f"{self.environment}: call reset() before step() or render()")
-        return self._state
+        return self._episode.state
 
     def _observation(self, *, begins: bool = False) -> Seen | np.integer:
         if self._is_index:
-            return np.int64(self._index)
+            return np.int64(self._episode.index)
+        previous, elapsed = self._episode.previous, self._episode.elapsed
         if self._frame_stack is not None:
-            states, context = self._started()[None], (np.array([self._previous]), np.array([self._elapsed]))
+            states, context = self._started()[None], (np.array([previous]), np.array([elapsed]))
             self._frame_stack.push(states, _ONE, np.array([begins]))
             batch = self._frame_stack.current(states, *context)
             self._last = {k: v[0] for k, v in batch.items()} if isinstance(batch, dict) else batch[0]
             return self._last
-        return self.simulator.context.one(self._started(), self._previous, self._elapsed)
+        return self.simulator.context.one(self._started(), previous, elapsed)
 
 
 def _window(simulator: Simulator, fps: int) -> "Window":

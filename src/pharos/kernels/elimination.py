@@ -16,6 +16,9 @@ Markov chains"; Alfa, Xue and Ye (2002), "Accurate computation of the smallest e
 M-matrix"; pairs: Dekker (1971), "A floating-point technique for extending the available precision".
 """
 
+from typing import NamedTuple
+
+import numpy as np
 from numba import types
 
 from pharos.kernels.interpreted import interpreted_first, overload
@@ -25,13 +28,29 @@ SUM_LOSS = 2.0**-44  # more than sums lose
 SPLITTER = 2.0**27 + 1  # times a float, it splits it into halves of 26 bits
 
 
+class EliminationArrays(NamedTuple):
+    """Rows of a chain, their components, and the factors that `factorize` fills in: upper, lower, and pivot (N,)."""
+
+    first: np.ndarray
+    node: np.ndarray
+    weight: np.ndarray
+    begin: np.ndarray
+    stop: np.ndarray
+    up_first: np.ndarray
+    up_node: np.ndarray
+    low_first: np.ndarray
+    low_node: np.ndarray
+    upper: np.ndarray
+    lower: np.ndarray
+    pivot: np.ndarray
+
+
 @interpreted_first()
 @kernel(makes_arrays=False)
-def factorize(
-    first, node, weight, begin, stop, up_first, up_node, low_first, low_node, upper, lower, leaving, pivot, work
-):
-    """Fill in upper, lower, and leaving and pivot (N,): of each node, when all before it in its component are left out,
-    what leads out of the component, and what leaves the node. work (N,): zero before and after."""
+def factorize(chain, leaving, work):
+    """Fill in upper, lower, pivot and leaving (N,): of each node, when all before it in its component are left out,
+    what leaves the node, and what leads out of the component. work (N,): zero before and after."""
+    first, node, weight, begin, stop, up_first, up_node, low_first, low_node, upper, lower, pivot = chain
     for n in range(len(pivot)):
         out = pivot[n] * 0.0
         for k in range(first[n], first[n + 1]):
@@ -61,8 +80,9 @@ def factorize(
 
 @interpreted_first()
 @kernel(makes_arrays=False)
-def substitute(first, node, weight, begin, stop, up_first, up_node, low_first, low_node, upper, lower, pivot, right, x):
+def substitute(chain, right, x):
     """x (N + 1,) of the right sides (N,) float64, by what `factorize` filled in. x[N] = 0 before and after."""
+    first, node, weight, begin, stop, up_first, up_node, low_first, low_node, upper, lower, pivot = chain
     start = 0
     while start < len(pivot):
         end = stop[start]
@@ -85,9 +105,10 @@ def substitute(first, node, weight, begin, stop, up_first, up_node, low_first, l
 
 @interpreted_first()
 @kernel(makes_arrays=False)
-def improve(first, node, weight, rows, rewards, backward, v, policy):
+def improve(matrix, rows, rewards, backward, v, policy):
     """Sweep v (N + 1,) in place to the best of the rows of each node, from rows[n] to rows[n + 1], and keep that row in
-    policy (N,) if it is better beyond rounding. Returns how many were."""
+    policy (N,) if it is better beyond rounding. matrix: (first, node, weight). Returns how many were."""
+    first, node, weight = matrix
     count, size = 0, len(policy)
     for i in range(size):
         n = size - 1 - i if backward else i

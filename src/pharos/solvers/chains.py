@@ -91,9 +91,9 @@ class Chain:
         rows = (ordered.indptr, index[ordered.indices], ordered.data)
         blocks = np.searchsorted(numbers, numbers), np.searchsorted(numbers, numbers, side="right")
         factor = up_first, up_node, below.indptr, below.indices, *np.zeros((2, len(up_node)), dtype)
-        leaving, self._pivot, work = np.zeros((3, size), dtype)
-        self._parts = *rows, *blocks, *factor
-        elimination.factorize(*self._parts, leaving, self._pivot, work)
+        pivot, leaving, work = np.zeros((3, size), dtype)
+        self._parts = elimination.EliminationArrays._make((*rows, *blocks, *factor, pivot))
+        elimination.factorize(self._parts, leaving, work)
 
     def solve(self, right: np.ndarray) -> np.ndarray:
         """(M + 1,) x of b (M,), 0 at the end. Infinite or NaN if numbers are too small, or it is too large."""
@@ -113,7 +113,7 @@ class Chain:
             return np.append(self._iterated(right), 0.0)
         x: np.ndarray = np.empty(len(right) + 1, self.dtype)
         ordered: np.ndarray = np.zeros(len(right) + 1, self.dtype)
-        elimination.substitute(*self._parts, self._pivot, right[self._order], ordered)
+        elimination.substitute(self._parts, right[self._order], ordered)
         x[np.append(self._order, len(right))] = ordered
         return x
 

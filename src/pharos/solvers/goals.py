@@ -643,11 +643,10 @@ def _is_proper(choices: Choices, policy: np.ndarray) -> bool:
 
 def _swept(choices: Choices, v: np.ndarray, policy: np.ndarray) -> np.ndarray:
     """(M,) rows of a policy that is better than a proper one, as sweeps from its values v (M + 1,) have it."""
-    matrix, better = choices.matrix, policy.copy()
+    better = policy.copy()
+    matrix = (choices.matrix.indptr, choices.matrix.indices, choices.matrix.data)
     for sweep in range(SWEEPS):
-        if not elimination.improve(
-            matrix.indptr, matrix.indices, matrix.data, choices.rows, choices.rewards, sweep % 2 == 0, v, better
-        ):
+        if not elimination.improve(matrix, choices.rows, choices.rewards, sweep % 2 == 0, v, better):
             break
     return better if _is_proper(choices, better) else policy
 

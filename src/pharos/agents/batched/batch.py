@@ -40,17 +40,17 @@ class Batch:
     @property
     def steps(self) -> int:
         """Steps of each run so far, without the steps of a rollout beyond the end of the training."""
-        return min(self.lanes[-1].steps, self.lanes[-1].total)
+        return min(self.lanes[-1].steps, self.lanes[-1].group.total)
 
     @property
     def episodes(self) -> np.ndarray:
         """(N,) int64, finished episodes."""
-        return np.concatenate([lane.worlds.episodes[: lane.number] for lane in self.lanes])
+        return np.concatenate([lane.worlds.episodes[: lane.group.number] for lane in self.lanes])
 
     @property
     def returns(self) -> np.ndarray:
         """(N,) float64, the sums of the returns of finished episodes."""
-        return np.concatenate([lane.worlds.returns[: lane.number] for lane in self.lanes])
+        return np.concatenate([lane.worlds.returns[: lane.group.number] for lane in self.lanes])
 
     def learn(self, points: Sequence[int], at_point: Callable[[int], object]) -> None:
         """Train from `steps` on, and call `at_point` at each of the points.
@@ -86,7 +86,7 @@ class Batch:
 
     def set_parameters(self, i: int, parameters: Mapping[str, np.ndarray]) -> None:
         """Replace the network of run i by what `parameters` returned, on the processor alone."""
-        self.lanes[i // self.width].restore_network(i % self.width, parameters)
+        self.lanes[i // self.width].networks.restore_run(i % self.width, parameters)
 
     def state(self) -> dict[str, np.ndarray]:
         """State of the batch for `restore`, which goes on bit for bit. The arrays are copies."""

@@ -95,88 +95,88 @@ class DQNLane(Lane[QNetworks]):
     """
 
     agent = "dqn"
-    tensors = (*Lane.tensors, "target")
 
     def __init__(self, runs: Sequence[BatchRun], width: int, device: str = "cpu"):
         super().__init__(runs, width, device)
-        self._rows = torch.arange(width, device=device)[:, None]
-        self.target = self.parameters.clone()
-        self.target_values = self.views(self.target)
-        size, rows = int(self.shared["batch_size"]), int(self.shared["buffer_size"])
-        self.replay = Replay(self.keys, self.number, rows, self.copies, size, device, runs[0].observe.frames)
-        self._dq = torch.zeros((width, size, self.num_actions), device=device)
+        group, self._rows = self.group, torch.arange(width, device=device)[:, None]
+        self.target = self.networks.parameters.clone()
+        self.target_values = self.networks.views(self.target)
+        size, rows = int(group.shared["batch_size"]), int(group.shared["buffer_size"])
+        self.replay = Replay(group.keys, group.number, rows, group.copies, size, device, runs[0].observe.frames)
+        self._dq = torch.zeros((width, size, group.num_actions), device=device)
         self._recorded_step = CudaGraph(self.gradient_step, device)
         self.epsilon = np.zeros(width)
         names = ("initial_eps", "final_eps", "fraction")
-        self._exploration = tuple(self.own[f"exploration_{name}"] for name in names)
+        self._exploration = tuple(group.own[f"exploration_{name}"] for name in names)
         self._explores = np.zeros(width, np.bool_)
-        self._no_scores = np.zeros((width, self.copies, self.num_actions), np.float32)
-        self._remembers = device == "cpu" and all(remembers_targets(run) for run in self.runs)
+        self._no_scores = np.zeros((width, group.copies, group.num_actions), np.float32)
+        self._remembers = device == "cpu" and all(remembers_targets(run) for run in group.runs)
         self._target_table: torch.Tensor | None = None  # (W, S, A) values of target networks, if kept
-        self._target_calls = np.maximum(self.own["target_update_interval"].astype(np.int64) // self.copies, 1)
+        self._target_calls = np.maximum(group.own["target_update_interval"].astype(np.int64) // group.copies, 1)
 
     def network_for(self, shape: tuple[int, ...]) -> QNetworks:
         """See `Lane`."""
-        return QNetworks(shape, self.seen.is_image, self.shared["net_arch"], self.num_actions, self.device)
+        layers, num_actions = self.group.shared["net_arch"], self.group.num_actions
+        return QNetworks(shape, self.inputs.table.is_image, layers, num_actions, self.device)
 
     def probabilities(self, scores: np.ndarray) -> np.ndarray:
         """One-hot probabilities of the greedy action."""
-        return np.eye(self.num_actions)[scores.argmax(axis=1)]
+        return np.eye(self.group.num_actions)[scores.argmax(axis=1)]
 
     def step(self) -> None:
         """See `Lane`."""
         worlds, scores = self.worlds, self._no_scores
-        is_warming = self.steps < self.own["learning_starts"]
-        kernels.exploring(self.keys, self.calls, self.epsilon, is_warming, self._explores)
-        if not self._explores[: self.number].all():
+        is_warming = self.steps < self.group.own["learning_starts"]
+        kernels.exploring(self.group.keys, self.calls, self.epsilon, is_warming, self._explores)
+        if not self._explores[: self.group.number].all():
             scores = self.scores_of(worlds.seen)
-        if self.sets is None:
-            kernels.choose(self.keys, self.calls, self._explores, scores, self.actions)
+        if self.inputs.sets is None:
+            kernels.choose(self.group.keys, self.calls, self._explores, scores, self.actions)
         else:
-            sets = self.sets.of_states(torch.from_numpy(worlds.state).to(self.device)).cpu().numpy()
-            kernels.choose_of_sets(self.keys, self.calls, self._explores, scores, sets, self.actions)
+            sets = self.inputs.sets.of_states(torch.from_numpy(worlds.state).to(self.device)).cpu().numpy()
+            kernels.choose_of_sets(self.group.keys, self.calls, self._explores, scores, sets, self.actions)
         before = worlds.state.copy()
         self.execute_actions()
         self.replay.add(self.calls, before, worlds.next_state, self.actions, worlds.reward, worlds.flags)
-        self.steps += self.copies
+        self.steps += self.group.copies
         self.calls += 1
         self._follow_schedules()
-        self.collected = (self.collected + 1) % int(self.shared["train_freq"])
+        self.collected = (self.collected + 1) % int(self.group.shared["train_freq"])
         self.is_due = self.collected == 0 and bool(self._learns().any())
 
     def _learns(self) -> np.ndarray:
         """(W,) bool: runs that have begun to learn."""
-        return (self.steps > self.own["learning_starts"]) & ~self.is_idle
+        return (self.steps > self.group.own["learning_starts"]) & ~self.group.is_idle
 
     def _follow_schedules(self) -> None:
         """Copy to target networks that are due and anneal the exploration rates. Called after each step."""
         copied = np.flatnonzero(self.calls % self._target_calls == 0)
         if len(copied):
             self.copy_to_targets(copied)
-        progress = 1.0 - (1.0 - self.steps / self.total)
+        progress = 1.0 - (1.0 - self.steps / self.group.total)
         first, last, share = self._exploration
         kernels.anneal(first, last, share, progress, self.epsilon)
 
     def copy_to_targets(self, runs: np.ndarray) -> None:
         """Move the target networks of some runs towards the online ones, all the way if tau is 1."""
         rows = torch.from_numpy(runs).to(self.device)
-        tau = torch.from_numpy(self.own["tau"][runs].astype(np.float32)[:, None]).to(self.device)
+        tau = torch.from_numpy(self.group.own["tau"][runs].astype(np.float32)[:, None]).to(self.device)
         self._target_table = None
-        self.target[rows] = self.target[rows].mul_(1.0 - tau) + self.parameters[rows] * tau
+        self.target[rows] = self.target[rows].mul_(1.0 - tau) + self.networks.parameters[rows] * tau
 
     def update(self) -> None:
         """See `Lane`."""
-        number = int(self.shared["gradient_steps"])
+        number = int(self.group.shared["gradient_steps"])
         if number < 0:
-            number = int(self.shared["train_freq"]) * self.copies
+            number = int(self.group.shared["train_freq"]) * self.group.copies
         for draw in range(number):
             wait(self.device)
-            self.replay.sample(self.calls, draw, self.own["gamma"], int(self.shared["n_steps"]))
+            self.replay.sample(self.calls, draw, self.group.own["gamma"], int(self.group.shared["n_steps"]))
             self.learn_minibatch()
 
     def learn_minibatch(self) -> None:
         """One step of gradient descent on the minibatch that the replay memory has drawn."""
-        self.plan(self._learns())
+        self.networks.plan(self._learns())
         self._recorded_step()
 
     def gradient_step(self) -> None:
@@ -184,33 +184,34 @@ class DQNLane(Lane[QNetworks]):
         batch = self.replay
         for part in batch.drawn:
             part.send()
-        q_next = q_choice = self.masked(self._target_scores(batch.next_states), batch.next_states)
-        if self.shared["double"]:
-            q_choice = self.network.scores(self.values, self.observed(batch.next_states)).clone()
-            q_choice = self.masked(q_choice, batch.next_states)
-        q = self.network.scores(self.values, self.observed(batch.states))
+        q_next = q_choice = self.inputs.masked(self._target_scores(batch.next_states), batch.next_states)
+        if self.group.shared["double"]:
+            q_choice = self.networks.scores(self.inputs.observed(batch.next_states)).clone()
+            q_choice = self.inputs.masked(q_choice, batch.next_states)
+        q = self.networks.scores(self.inputs.observed(batch.states))
         minibatch = (batch.actions.tensor, batch.rewards.tensor, batch.discounts.tensor)
-        self.arithmetic.huber(q, q_next, q_choice, minibatch, self._dq, self.loss)
-        self.network.backward(self.values, self.gradient_views, self._dq)
-        self.adam()
+        networks = self.networks
+        networks.arithmetic.huber(q, q_next, q_choice, minibatch, self._dq, networks.loss)
+        networks.network.backward(networks.values, networks.gradient_views, self._dq)
+        networks.adam()
 
     def _target_scores(self, states: PinnedBuffer) -> torch.Tensor:
         """(W, B, A) values of states (W, B) by the target networks."""
         if not self._remembers:
-            return self.network.scores(self.target_values, self.observed(states)).clone()
+            return self.networks.scores(self.inputs.observed(states), self.target_values).clone()
         if self._target_table is None:
             self._target_table = self._all_target_scores(states.array.shape[1])
         return self._target_table[self._rows, states.tensor]
 
     def _all_target_scores(self, size: int) -> torch.Tensor:
         """(W, S, A) of all states, `size` of each run at a time. Runs with fewer states repeat their last one."""
-        numbers = np.array([run.mdp.num_states for run in self.runs])
-        scores = torch.empty((self.width, int(numbers.max()), self.num_actions), device=self.device)
-        states = PinnedBuffer((self.width, size), torch.int64, self.device)
+        numbers = np.array([run.mdp.num_states for run in self.group.runs])
+        scores = torch.empty((self.group.width, int(numbers.max()), self.group.num_actions), device=self.device)
+        states = PinnedBuffer((self.group.width, size), torch.int64, self.device)
         for first in range(0, scores.shape[1], size):
             states.array[:] = np.minimum(np.arange(first, first + size), numbers[:, None] - 1)
             part = scores[:, first : first + size]
-            part[:] = self.network.scores(self.target_values, self.observed(states))[:, : part.shape[1]]
+            part[:] = self.networks.scores(self.inputs.observed(states), self.target_values)[:, : part.shape[1]]
         return scores
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
@@ -218,13 +219,17 @@ class DQNLane(Lane[QNetworks]):
         super().restore(arrays)
         self._target_table = None
 
+    def tensors(self) -> dict[str, torch.Tensor]:
+        """See `Lane`."""
+        return {**super().tensors(), "target": self.target}
+
     def own_arrays(self) -> dict[str, np.ndarray]:
         """See `Lane`."""
         return {"epsilon": self.epsilon, **self.replay.arrays(self.calls)}
 
     def stored(self, i: int) -> dict[str, np.ndarray]:
         """The online and the target network of run i."""
-        target = self.as_stored(self.target_values, i)
+        target = self.networks.as_stored(self.target_values, i)
         return {
             **super().stored(i),
             **{name.replace("q_net", "q_net_target", 1): value for name, value in target.items()},
