@@ -115,13 +115,13 @@ _MOST_PROCESSES = 1024  # of a machine that anybody may mean
 _UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12, "KI": 2**10, "MI": 2**20, "GI": 2**30, "TI": 2**40}
 
 
-def parse_size(text: str | None, option: str = "--memory") -> int | None:
+def parse_size(text: str | None) -> int | None:
     """`2GiB` -> 2147483648, `500MB` -> 500000000, `4096` -> 4096. ParameterError if it is no size."""
     if text is None:
         return None
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*([KMGT]I?)?B?\s*", text.upper())
     if match is None:
-        raise ParameterError(f"{option} {text!r}; expected a size such as 2GiB, 500MB or 4096 (bytes)")
+        raise ParameterError(f"--memory {text!r}; expected a size such as 2GiB, 500MB or 4096 (bytes)")
     return int(float(match[1]) * _UNITS[match[2] or ""])
 
 

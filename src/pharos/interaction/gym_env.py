@@ -89,7 +89,7 @@ class CompiledStep:
 
 
 class StepChance:
-    """What is drawn in a step: the executed action, whether it has an effect, and an outcome of the rules.
+    """Draws of a step: the executed action, whether it has an effect, and an outcome of the rules.
 
     Attributes:
         is_none: whether nothing is drawn.

@@ -39,10 +39,10 @@ def pairs_within(mdp: TabularMDP, steps: int | None = None) -> np.ndarray:
     return is_reached
 
 
-def nodes_within(mdp: TabularMDP, steps: int | None = None) -> np.ndarray:
-    """(S, W) bool: the nodes of values that can be reached within `steps` steps from a start: `pairs_within` under
-    sticky actions, else `states_within`. Start states without a previous action are not among them."""
-    return pairs_within(mdp, steps) if mdp.is_sticky else states_within(mdp, steps)[:, None]
+def nodes_within(mdp: TabularMDP) -> np.ndarray:
+    """(S, W) bool: the nodes of values that can be reached from a start: `pairs_within` under sticky actions, else
+    `states_within`. Start states without a previous action are not among them."""
+    return pairs_within(mdp) if mdp.is_sticky else states_within(mdp)[:, None]
 
 
 def nodes_after(mdp: TabularMDP, nodes: np.ndarray, lone: np.ndarray) -> np.ndarray:

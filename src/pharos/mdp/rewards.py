@@ -281,15 +281,12 @@ _RECORDED_ROWS = 1 << 16
 Blocks = Iterator[tuple[int, np.ndarray, float]]
 
 
-def rewards_of_space(
-    space: "StateSpace", rewards: "npt.ArrayLike | Callable[..., float] | None" = None, *, workers: int | None = None
-) -> "Rewards":
+def rewards_of_space(space: "StateSpace", rewards: "npt.ArrayLike | Callable[..., float] | None" = None) -> "Rewards":
     """The rewards of all transitions of a state space.
 
     Args:
         rewards: None, an (S, A) array, or a function reward(self, state, action, next_state) -> float, or with the
             outcome as one more argument.
-        workers: threads. The result does not depend on them.
     Raises:
         ParameterError: the array has the wrong shape, or holds NaN or infinity.
         RuleError: the reward function gave NaN or infinity for a transition, which the message names.
@@ -308,7 +305,7 @@ def rewards_of_space(
             f"the rewards; import the module that registers it, or pass rewards as an (S, A) array"
         )
     env = space.environment if rewards is None else _with_reward(space.environment, rewards)
-    return _rewards_of_blocks(space, env, _blocks(space, env, workers))
+    return _rewards_of_blocks(space, env, _blocks(space, env))
 
 
 def ranged_rewards(space: "StateSpace") -> "Rewards":
@@ -317,7 +314,7 @@ def ranged_rewards(space: "StateSpace") -> "Rewards":
     assert env is not None
 
     def compute(start: int, stop: int) -> "Rewards":
-        return _rewards_of_blocks(space, env, _blocks(space, env, None, start, stop), start, stop)
+        return _rewards_of_blocks(space, env, _blocks(space, env, start, stop), start, stop)
 
     return RangedRewards((space.num_states, space.num_actions), compute)
 
@@ -474,9 +471,7 @@ def _joined(outcomes: PaidOutcomes) -> PaidOutcomes:
     return PaidOutcomes(which[first], states[first], rewards[first], sums)
 
 
-def _blocks(
-    space: "StateSpace", env: Environment, workers: int | None, first: int = 0, last: int | None = None
-) -> Blocks:
+def _blocks(space: "StateSpace", env: Environment, first: int = 0, last: int | None = None) -> Blocks:
     """Blocks of rewards of the states [first, last), in order."""
     from pharos.rules import rules_of
 
@@ -493,7 +488,7 @@ def _blocks(
         outcomes = dynamics.entries_of(np.arange(start, stop))
         return rules.expected_block(states, outcomes, terminal, start, stop, largest=largest), float(largest[0])
 
-    threads = rules.threads(usable_workers(workers))
+    threads = rules.threads(usable_workers(None))
     with ThreadPoolExecutor(threads) as pool:
         window = 2 * threads
         pending = [pool.submit(block, start) for start in starts[:window]]

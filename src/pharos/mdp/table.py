@@ -262,13 +262,7 @@ def checked_outcomes(
     return table, flat.reshape(table.shape), residuals.reshape(states, actions)
 
 
-def compact_outcomes(
-    successors: np.ndarray,
-    probabilities: np.ndarray,
-    *,
-    most_padding: float = MOST_PADDING,
-    most_vectors: int = TWO_BYTE_CODES,
-) -> dict[str, Any]:
+def compact_outcomes(successors: np.ndarray, probabilities: np.ndarray) -> dict[str, Any]:
     """Arguments of an `OutcomeTable`, from (S, A, K) arrays: the possible outcomes alone, in their order."""
     num_states, num_actions, _ = successors.shape
     possible = probabilities > 0
@@ -281,13 +275,13 @@ def compact_outcomes(
     width = int(counts.max())
     successors, probabilities, possible = (each[..., :width] for each in (successors, probabilities, possible))
     result: dict[str, Any] = {"num_actions": num_actions}
-    ragged = counts.sum() < (1 - most_padding) * num_states * num_actions * width
+    ragged = counts.sum() < (1 - MOST_PADDING) * num_states * num_actions * width
     if ragged:
         result["offsets"] = np.concatenate([[0], np.cumsum(counts.ravel())])
         result["successors"] = as_indices(successors[possible], num_states)
     else:
         result["successors"] = as_indices(np.where(possible, successors, successors[..., :1]), num_states)
-    codes, palette = _palette(np.ascontiguousarray(probabilities).reshape(-1, width), most_vectors)
+    codes, palette = _palette(np.ascontiguousarray(probabilities).reshape(-1, width), TWO_BYTE_CODES)
     if palette is None:
         result["probabilities"] = probabilities[possible] if ragged else np.ascontiguousarray(probabilities)
     else:

@@ -134,17 +134,6 @@ def fault(typing_context, view):
     return types.int64(view), codegen
 
 
-@intrinsic
-def clear_fault(typing_context, view):
-    """Set the fault back to 0."""
-
-    def codegen(context, builder, sig, args):
-        builder.store(ir.Constant(_WORD, 0), _view(context, builder, sig, args).fault)
-        return context.get_dummy_value()
-
-    return types.void(view), codegen
-
-
 def _checked_component(builder, view, index):
     """The component `index` as in Python (negative from the end); component 0 and a fault if there is none."""
     checked = cgutils.alloca_once_value(builder, index)

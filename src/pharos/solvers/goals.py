@@ -327,9 +327,7 @@ class GoalProblem:
 
     # Solving ----------------------------------------------------------------------------------------------------------
 
-    def solve_in(
-        self, inside: np.ndarray, tolerance: float, progress: Callable[[int, float], None] | None = None
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def solve_in(self, inside: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """((N,) values, (N,) error of each, (N,) choices) if `inside` (M + 1,) bool holds, at the end 0, else
         infinite.
 
@@ -353,7 +351,7 @@ class GoalProblem:
             origin=choices.origin[rows],
         )
         v, error = np.full(len(inside), np.inf), np.zeros(len(inside))
-        values, errors, policy, _ = _values(part, self.proper(part)[1], tolerance, self._infinite, progress)
+        values, errors, policy, _ = _values(part, self.proper(part)[1], tolerance, self._infinite, None)
         v[nodes], error[nodes] = np.append(self.sign * values, 0.0), np.append(errors, 0.0)
         origin = np.full(len(inside) - 1, -1)
         origin[nodes[:-1]] = part.origin[policy]

@@ -267,14 +267,10 @@ class Journal:
         check_rules(self.path, self.plan.env, self.plan.layout, self.stored_states(position.count), successors, bits)
 
 
-def number_blocks(file: GrowingFile, dtype: np.dtype, entries: int | None = None) -> Iterator[tuple[int, np.ndarray]]:
-    """Blocks of the numbers in a file: pairs (index of the first one, array), in order.
-
-    Args:
-        entries: of a block, at most. None for COPIED_BYTES.
-    """
+def number_blocks(file: GrowingFile, dtype: np.dtype) -> Iterator[tuple[int, np.ndarray]]:
+    """Blocks of at most COPIED_BYTES of the numbers in a file: pairs (index of the first one, array), in order."""
     size = file.bytes // dtype.itemsize
-    block_size = entries or max(1, COPIED_BYTES // dtype.itemsize)
+    block_size = max(1, COPIED_BYTES // dtype.itemsize)
     for first in range(0, size, block_size):
         shape = (min(block_size, size - first),)
         yield first, np.memmap(file.path, dtype, "r", offset=first * dtype.itemsize, shape=shape)

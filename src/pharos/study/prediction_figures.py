@@ -40,12 +40,12 @@ def unseen_figures(
     return drawn
 
 
-def predicted_by_class(part: "pd.DataFrame", predictor: str | None = None) -> "Figure | None":
+def predicted_by_class(part: "pd.DataFrame") -> "Figure | None":
     """A panel for each class: regret against the prediction by a line through the other classes."""
     from pharos.study.cross_validation import class_predictions
     from pharos.study.leave_one_class_out import Cells
 
-    predictor = predictor or _learner(part)
+    predictor = _learner(part)
     cells = Cells.of(part, [predictor], "greedy")
     if len(np.unique(cells.classes)) < 2:
         return None
@@ -68,9 +68,9 @@ def predicted_by_class(part: "pd.DataFrame", predictor: str | None = None) -> "F
     return figure
 
 
-def observations_of_mdps(part: "pd.DataFrame", predictor: str | None = None) -> "Figure | None":
+def observations_of_mdps(part: "pd.DataFrame") -> "Figure | None":
     """A panel for each MDP, up to MOST_PANELS: regret under each observation, of the agent and as predicted."""
-    predictor = predictor or _learner(part)
+    predictor = _learner(part)
     observations = list(dict.fromkeys(part["observation"]))
     groups = [
         (key, rows) for key, rows in part.groupby(["environment", "instance", "chance"], sort=False) if len(rows) > 1

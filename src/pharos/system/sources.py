@@ -65,11 +65,6 @@ class Source:
         where = self.name.rpartition(":")[0]
         return None if where.endswith(".py") else where
 
-    @property
-    def is_changed(self) -> bool:
-        """Whether the file is no longer as it was, or gone."""
-        return _checksum(self.file) != self.checksum
-
     def __str__(self) -> str:
         return f"{self.name} ({self.file})"
 

@@ -206,7 +206,7 @@ MASKED = -1e8
 
 
 class NetworkInputs:
-    """What the networks of a lane are given: observations of states, and which actions are available there.
+    """Inputs of the networks of a lane: observations of states, and the actions that are available there.
 
     Attributes:
         table: of all observations. sets: of the available actions, None if all are available to all runs.
