@@ -358,6 +358,7 @@ def test_groups_of_tasks_that_lose_alone_are_named():
     suite = load_suite("v1")
     vectors = [task.name for task in suite.core if task.observation == "vector"]
     assert readings_of(worse(vectors)) == ["vector"]
+    assert readings_of(worse(vectors, by=1.0)) == ["vector"]  # of which one ends by time alone
     assert readings_of(worse([task.name for task in suite.core])) == []  # no group is spared
     ladder = next(ladder for ladder in suite.ladders if ladder.axis == "credit")
     assert readings_of(worse([task.name for task in ladder.tasks])) == ["credit"]

@@ -13,8 +13,26 @@ from typing import Any
 import numpy as np
 
 from pharos.benchmark.comparison import LEAST_DIFFERENCE, WORSE, compare_groups
-from pharos.benchmark.contents import MOST_RECORD_LETTERS, Contents, Source, contents_of, listed, run_warnings
-from pharos.benchmark.diagnosis import ONE_ACTION, groups_of, nearest, policies_of, seeds_sentence
+from pharos.benchmark.contents import (
+    MOST_RECORD_LETTERS,
+    Contents,
+    Source,
+    contents_of,
+    fails_on_the_lowest_rung,
+    listed,
+    run_warnings,
+)
+from pharos.benchmark.diagnosis import (
+    LOSS,
+    ONE_ACTION,
+    groups_of,
+    is_of,
+    nearest,
+    outside,
+    policies_of,
+    seeds_sentence,
+    suspicion,
+)
 from pharos.benchmark.doctor import on_policy, readings
 from pharos.benchmark.examination import EXAMINATION_PROTOCOL, NAMES, Examination, examine
 from pharos.benchmark.faults import FAMILIES, FAULTS, HEALTHY
@@ -48,7 +66,6 @@ EXPLORER = (
     "Its values are those of the policy that explores, as of SARSA. If it ought to take the largest next value, this "
     "is a fault."
 )
-LOSS = 0.1  # of score, on a group of tasks or an axis, that is a symptom
 IN_PLAY = 0.05  # of score, that is lost by chance in play
 LOSS_SIGNS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "vector": (
@@ -72,6 +89,8 @@ LOSS_SIGNS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "credit": ("look at gamma, lambda and returns of several steps", ("gamma_half",)),
 }
 """Groups of tasks and axes that one mistake hits: what to try, and the faults that they are a sign of."""
+WHERE = {"rewards of several sizes": "with rewards of several sizes", "ended by time alone": "ended by time alone"}
+"""Groups by property, in words."""
 LEAST_REGRET, MOST_REGRET = -0.5, 1e6  # that a curve may have; what is evaluated by episodes may be below 0
 
 
@@ -322,9 +341,19 @@ def diagnosis_of_results(contents: Contents) -> Diagnosis:
         if "first policy came after" not in text
     ]
     trusted = accuracy(kind or "dqn", SCORES)
-    return _diagnosis(
+    diagnosis = _diagnosis(
         contents.agent.name, kind, mistakes, answer, trusted, scores, numbers, from_results=True, lacks=lacks
     )
+    hint = "" if diagnosis.findings else _suspicion_of(contents)
+    return replace(diagnosis, verdict=f"{diagnosis.verdict} {hint}".strip())
+
+
+def _suspicion_of(contents: Contents) -> str:
+    """A sentence on a loss that too few seeds show, or empty, see `suspicion`."""
+    if (near := nearest(contents)) is None:
+        return ""
+    by_seen, by_property = groups_of(contents)
+    return suspicion(contents.agent.results, contents.beside[near[0]].results, {**by_seen, **by_property})
 
 
 def _check_curves(contents: Contents) -> None:
@@ -375,7 +404,7 @@ def findings_of(contents: Contents) -> list[Finding]:
     findings = _own_findings(contents)
     if (near := nearest(contents)) is None:
         return findings
-    other, comparison = contents.beside[near[0]], contents.comparisons[near[0]]
+    ours, other, comparison = contents.agent.results, contents.beside[near[0]], contents.comparisons[near[0]]
     below = [name for name in contents.agent.score.below_random if name not in other.score.below_random]
     if len(below) * 4 >= len(contents.agent.score.tasks):
         wrong = (
@@ -394,16 +423,31 @@ def findings_of(contents: Contents) -> list[Finding]:
         return [*findings, Finding("everywhere", 1.0, 0.0, wrong, advice, 10.0, FAMILIES["updates"][1])]
     by_seen, by_property = groups_of(contents)
     groups = {**by_seen, **by_property}
-    core = {name for names in by_seen.values() for name in names}
-    for name, each in compare_groups(contents.agent.results, other.results, groups).items():
-        rest = compare_groups(contents.agent.results, other.results, {"": sorted(core - {*groups[name]})})
-        spared = rest[""].interval.value if rest else 0.0
-        if name in LOSS_SIGNS and each.verdict == WORSE and spared > each.interval.value / 2:
-            where = f"core tasks with {name}" if name in by_property else f"core tasks seen as {name}"
-            findings += _loss(name, each.interval.value, f"{where}, beside {spared:+.2f} on the others", other.name)
+    core = sorted(name for names in by_seen.values() for name in names)
+    losses: dict[str, float] = {}  # the largest first
+    for name, each in sorted(compare_groups(ours, other.results, groups).items(), key=lambda i: i[1].interval.value):
+        loss, spared = each.interval.value, outside(ours, other.results, core, groups[name])
+        if name not in LOSS_SIGNS or each.verdict != WORSE or spared <= loss / 2:
+            continue
+        if not any(is_of(loss, outside(ours, other.results, groups[name], groups[more])) for more in losses):
+            losses[name] = loss
+            where = f"core tasks {WHERE.get(name, f'seen as {name}')}"
+            beside = "" if np.isnan(spared) else f", beside {spared:+.2f} on the others"
+            findings += _loss(name, loss, f"{where}{beside}", other.name)
     for axis, own in axes.items():
-        if own.verdict == WORSE:
-            findings += _loss(axis, own.interval.value, f"the axis of {axis}", other.name)
+        if own.verdict != WORSE:
+            continue
+        rung, others = contents.agent.score.axes[axis], other.score.axes[axis]
+        loss = _loss(axis, own.interval.value, f"the axis of {axis}", other.name)
+        if loss and fails_on_the_lowest_rung(rung) and not fails_on_the_lowest_rung(others):
+            scores = f"{rung.lowest.value:.2f}, {other.name} {others.lowest.value:.2f}"
+            wrong = f"{loss[0].wrong}, whose lowest rung it fails already ({scores}): not a matter of {axis}"
+            loss = [
+                replace(
+                    loss[0], wrong=wrong, advice="look for a bug in rewards and updates first", strength=0.0, faults=()
+                )
+            ]
+        findings += loss
     return findings
 
 
