@@ -6,7 +6,7 @@
 Each round has all faults once, each with hyperparameters and seeds of its own, and three healthy agents of each kind.
 An agent takes about 6 s of a processor. Writes src/pharos/benchmark/data/fault_profiles.csv.
 
-With `--scores` it writes fault_scores.csv beside it: scores on some tasks of v1, for finished runs, of all but agents
+With `--scores` it writes fault_scores.csv beside it: what a finished run has of some tasks of v1, of all but agents
 whose seeds are ignored, and of two healthy ones a round. An agent takes about 3 s a task.
 """
 
@@ -19,7 +19,7 @@ import numpy as np
 from pharos.benchmark import faults, load_suite
 from pharos.benchmark.doctor import readings
 from pharos.benchmark.examination import NAMES, examine
-from pharos.benchmark.profiles import DECIMALS, PROFILES_FILE, SCORED_TASKS, SCORES
+from pharos.benchmark.profiles import DECIMALS, PROFILES_FILE, SCORED_TASKS, SCORES, run_readings
 from pharos.training.budget import generated_curve
 
 FURTHER = 100  # between numbers of the healthy agents of a round
@@ -59,19 +59,17 @@ def examinations(agent, fault, number):
 
 
 def scores(agent, fault, number):
-    """Scores of one agent on SCORED_TASKS, with one seed."""
-    suite, numbers = load_suite("v1"), {}
+    """Readings of one agent's runs of SCORED_TASKS, with one seed."""
+    suite, curves, policies = load_suite("v1"), {}, {}
     protocol = suite.protocol
     for name in SCORED_TASKS:
-        learn, task = (
-            faults.faulty_agent(agent, fault, **setting(agent, fault, number)),
-            suite.task(name).check(protocol),
-        )
+        learn = faults.faulty_agent(agent, fault, **setting(agent, fault, number))
         options = {"steps": protocol.steps, "evaluations": protocol.evaluations, "seed": 10 * number}
         with np.errstate(all="ignore"):
-            rows = generated_curve(learn, task, **options).rows[1:]
-        numbers[f"score_{name}"] = 1 - float(np.clip(np.mean([row["normalized_regret"] for row in rows]), 0, 1))
-    return numbers
+            curve = generated_curve(learn, suite.task(name).check(protocol), **options)
+        curves[name] = np.array([[row["normalized_regret"] for row in curve.rows[1:]]])
+        policies[name] = curve.policies
+    return run_readings(curves, policies)
 
 
 def write(rows, file=PROFILES_FILE):

@@ -35,7 +35,7 @@ from pharos.benchmark.diagnosis import (
 )
 from pharos.benchmark.doctor import on_policy, readings
 from pharos.benchmark.examination import EXAMINATION_PROTOCOL, NAMES, Examination, examine
-from pharos.benchmark.faults import FAMILIES, FAULTS, HEALTHY
+from pharos.benchmark.faults import FAMILIES, FAULTS, HEALTHY, alike
 from pharos.benchmark.profiles import (
     BROKEN,
     CREDIBLE,
@@ -53,10 +53,11 @@ from pharos.benchmark.profiles import (
     judged,
     kind_of,
     likeness,
+    run_readings,
     shipped,
     suspect,
+    with_signs,
 )
-from pharos.benchmark.results import AgentResults
 from pharos.benchmark.scores import run_scores
 from pharos.benchmark.suite import Suite, load_suite
 from pharos.errors import ParameterError
@@ -108,7 +109,7 @@ class Diagnosis:
         strange: whether it is farther from all known faults, and from health, than known ones are.
         accuracy: how often the likeness was right for agents that the library did not have.
         scores: by world, or by task of a finished run: 1 optimal and 0 as uniform play, mean of the seeds.
-        readings: all numbers, see `doctor.readings`. Of a finished run see `score_readings`.
+        readings: all numbers, see `doctor.readings`. Of a finished run see `run_readings`.
         on_policy: whether its values are those of the policy that explores, as of SARSA. If so, `readings` are by what
             was played, not by the largest next value. It is no fault of a learner on-policy.
         from_results: whether it is the diagnosis of a finished run.
@@ -145,10 +146,10 @@ class Diagnosis:
         right = self.accuracy
         if right.agents and self.from_results:
             return (
-                f"By scores on {pluralize(len(SCORED_TASKS), 'task')} alone. Of {right.agents} agents of one author, "
-                f"each left out of the table in turn, the fault was the likeliest for {right.first:.0%}, among three "
-                f"for {right.three:.0%}; health was the likeliest for {right.healthy:.0%} of the healthy ones. "
-                "It is right less often for other code. Values say more: `pharos diagnose AGENT`."
+                f"By what was learnt on {pluralize(len(SCORED_TASKS), 'task')} alone. Of {right.agents} agents of one "
+                f"author, each left out of the table in turn, the fault was the likeliest for {right.first:.0%}, "
+                f"among three for {right.three:.0%}; health was the likeliest for {right.healthy:.0%} of the healthy "
+                f"ones. {self._alike}It is right less often for other code. Values say more: `pharos diagnose AGENT`."
             )
         if not right.agents:
             return "The table has one agent with each fault, so nothing is known of how often the likeness is right."
@@ -157,6 +158,19 @@ class Diagnosis:
             f"{right.first:.0%}, among three for {right.three:.0%}; {right.healthy:.0%} of the healthy ones were "
             f"called healthy. If all agents with a fault were left out, the answer was none of the known ones, or the "
             f"right family, for {right.unknown:.0%}."
+        )
+
+    @property
+    def _alike(self) -> str:
+        """A sentence on the faults that a finished run hardly tells from the likeliest, or empty."""
+        group = alike(self.kind, next(iter(self.likeness), ""))
+        if len(group) == 1:
+            return ""
+        names = listed(["healthy" if name == HEALTHY else name for name in group])
+        share = sum(self.likeness[name] for name in group)
+        return (
+            f"A run hardly tells {names} apart, so read them as one ({share:.2f}): the likeliest group was right for "
+            f"{self.accuracy.alike:.0%}. "
         )
 
     @property
@@ -321,10 +335,10 @@ def diagnosis_of_results(contents: Contents) -> Diagnosis:
     _check_curves(contents)
     scores = {name: float(runs.mean()) for name, runs in run_scores(results).items()}
     findings = sorted(findings_of(contents), key=lambda each: -each.strength)
-    numbers, lacks = score_readings(results), missing_tasks(contents)
+    numbers, lacks = run_readings(results.curves, policies_of(results)), missing_tasks(contents)
     answer = Judgement(tuple(findings), {}, None, False)
     if not lacks:
-        shares = likeness(numbers, library_of(kind, SCORES))
+        shares = with_signs(likeness(numbers, library_of(kind, SCORES)), findings)
         signs = {fault for each in findings for fault in each.faults}
         fault = next((each for each in [suspect(shares)] if each in signs), None)
         findings.sort(key=lambda each: fault not in each.faults)
@@ -340,7 +354,7 @@ def diagnosis_of_results(contents: Contents) -> Diagnosis:
         for text in (*seeds_sentence([contents.agent]), *run_warnings(results))
         if "first policy came after" not in text
     ]
-    trusted = accuracy(kind or "dqn", SCORES)
+    trusted = accuracy(kind or "dqn", SCORES, frozenset(numbers))
     diagnosis = _diagnosis(
         contents.agent.name, kind, mistakes, answer, trusted, scores, numbers, from_results=True, lacks=lacks
     )
@@ -370,15 +384,6 @@ def _check_curves(contents: Contents) -> None:
                 f"results of {contents.agent.name}: {name} has normalised regret of {curve.min():.3g} to "
                 f"{curve.max():.3g}; expected 0, optimal, to {MOST_REGRET:g}; take the file as it was written"
             )
-
-
-def score_readings(results: AgentResults) -> dict[str, float]:
-    """Numbers of a finished run that are held against those of known faults: scores on SCORED_TASKS that it has.
-
-    `score_` and the name of the task, the mean of its seeds.
-    """
-    scores = run_scores(results)
-    return {f"score_{name}": float(scores[name].mean()) for name in SCORED_TASKS if name in scores}
 
 
 def missing_tasks(contents: Contents) -> str:

@@ -73,6 +73,21 @@ FAMILIES = {
     "seeds": ("random numbers", ("seeds_ignored",)),
 }
 """Families of faults: name -> what they are about, and which."""
+ALIKE = {
+    "dqn": (
+        (HEALTHY, "bytes_not_divided", "epsilon_stuck", "replay_too_small", "truncation_as_end"),
+        ("last_feature_lost", "terminal_bootstrapped"),
+        ("learning_rate_high", "frames_reshaped"),
+        ("target_never_copied", "next_is_observation", "learning_rate_low", "gamma_half", "rewards_shifted"),
+    ),
+    "ppo": ((HEALTHY, "truncation_as_end"),),
+}
+"""Faults by agent that a finished run hardly tells apart, nor from health. Each other one is alone."""
+
+
+def alike(agent: str, fault: str) -> tuple[str, ...]:
+    """The faults that a finished run of an agent hardly tells from a fault, which is among them."""
+    return next((group for group in ALIKE.get(agent, ()) if fault in group), (fault,))
 
 
 def faulty_agent(
