@@ -11,7 +11,7 @@ from pharos import benchmark
 from pharos.benchmark import AgentResults, compare, power
 from pharos.benchmark.agent_diagnosis import diagnosis_of_results
 from pharos.benchmark.comparison import compare_groups
-from pharos.benchmark.contents import contents_of, residual_tasks
+from pharos.benchmark.contents import contents_of, residual_tasks, sentence
 from pharos.benchmark.diagnosis import fall_everywhere, falls, groups_of, strengths, suspicion, without_verdict
 from pharos.benchmark.page import page
 from pharos.benchmark.properties import known_properties, properties_of, purpose_of
@@ -140,6 +140,9 @@ def test_who_fails_on_the_lowest_rung_is_told_that_it_is_no_matter_of_the_axis()
         "Fails on the lowest rung of exploration already, with a score of 0.20 (0.19 to 0.21) (DQN 1.00): not a" in text
     )
     assert "lowest rung of credit" not in text and "lowest rung of scale" not in text
+    assert sentence(own).startswith(
+        "mine fails on the lowest rung of exploration already (0.20 and DQN 1.00), assigns "
+    )
     rows = {row[0]: row[1:] for row in falls(own)}
     assert [float(rows[axis][1].split()[0]) for axis in AXES] == pytest.approx([0.15, 0.85, 0.4], abs=0.011)
     assert rows["credit"][2] == "1.00, 0.40"
@@ -336,7 +339,7 @@ def test_the_kind_is_asked_for_where_the_name_does_not_say_it():
 def test_runs_without_a_policy_and_with_one_at_the_end_are_told():
     names = [task.name for task in SUITE.tasks]
     late = np.ones((5, 3)) - np.array([0.0, 0.0, 0.4])
-    for curve, sentence in (
+    for curve, said in (
         (np.ones((5, 3)), "In 40 of 60 runs all 3 evaluations are random play: was no policy yielded?"),
         (
             late,
@@ -344,7 +347,7 @@ def test_runs_without_a_policy_and_with_one_at_the_end_are_told():
         ),
     ):
         results_of_most = replace(HEALTHY, curves=HEALTHY.curves | dict.fromkeys(names[:8], curve))
-        assert sentence in text_of(page(contents_of(results_of_most, beside=[], suite=SUITE)))
+        assert said in text_of(page(contents_of(results_of_most, beside=[], suite=SUITE)))
         results_of_few = replace(HEALTHY, curves=HEALTHY.curves | dict.fromkeys(names[:2], curve))
         assert "evaluations are random" not in text_of(page(contents_of(results_of_few, beside=[], suite=SUITE)))
 

@@ -419,6 +419,11 @@ def test_groups_of_tasks_that_lose_alone_are_named():
     assert readings_of(worse([task.name for task in suite.core])) == []  # no group is spared
     ladder = next(ladder for ladder in suite.ladders if ladder.axis == "credit")
     assert readings_of(worse([task.name for task in ladder.tasks])) == ["credit"]
+    # who fails on the lowest rung already, where rewards are small costs, say, lacks something else
+    for names, signs in ((ladder.tasks, ()), (ladder.tasks[1:], ("gamma_half",))):
+        (line,) = findings_of(contents_of(worse([task.name for task in names], by=1.0)))
+        assert line.reading == "credit" and line.faults == signs
+        assert ("fails already (0.00, DQN 1.00): not a matter of credit" in line.wrong) == (not signs)
     assert readings_of(worse([task.name for task in suite.tasks])) == ["everywhere"]
 
 

@@ -443,16 +443,13 @@ def findings_of(contents: Contents) -> list[Finding]:
         if own.verdict != WORSE:
             continue
         rung, others = contents.agent.score.axes[axis], other.score.axes[axis]
-        loss = _loss(axis, own.interval.value, f"the axis of {axis}", other.name)
-        if loss and fails_on_the_lowest_rung(rung) and not fails_on_the_lowest_rung(others):
+        lines = _loss(axis, own.interval.value, f"the axis of {axis}", other.name)
+        if lines and fails_on_the_lowest_rung(rung) and not fails_on_the_lowest_rung(others):
             scores = f"{rung.lowest.value:.2f}, {other.name} {others.lowest.value:.2f}"
-            wrong = f"{loss[0].wrong}, whose lowest rung it fails already ({scores}): not a matter of {axis}"
-            loss = [
-                replace(
-                    loss[0], wrong=wrong, advice="look for a bug in rewards and updates first", strength=0.0, faults=()
-                )
-            ]
-        findings += loss
+            wrong = f"{lines[0].wrong}, whose lowest rung it fails already ({scores}): not a matter of {axis}"
+            advice = "look for a bug in rewards and updates first"
+            lines = [replace(lines[0], wrong=wrong, advice=advice, strength=0.0, faults=())]
+        findings += lines
     return findings
 
 
