@@ -339,7 +339,7 @@ def test_the_kind_is_asked_for_where_the_name_does_not_say_it():
 def test_runs_without_a_policy_and_with_one_at_the_end_are_told():
     names = [task.name for task in SUITE.tasks]
     late = np.ones((5, 3)) - np.array([0.0, 0.0, 0.4])
-    for curve, said in (
+    for curve, text in (
         (np.ones((5, 3)), "In 40 of 60 runs all 3 evaluations are random play: was no policy yielded?"),
         (
             late,
@@ -347,7 +347,7 @@ def test_runs_without_a_policy_and_with_one_at_the_end_are_told():
         ),
     ):
         results_of_most = replace(HEALTHY, curves=HEALTHY.curves | dict.fromkeys(names[:8], curve))
-        assert said in text_of(page(contents_of(results_of_most, beside=[], suite=SUITE)))
+        assert text in text_of(page(contents_of(results_of_most, beside=[], suite=SUITE)))
         results_of_few = replace(HEALTHY, curves=HEALTHY.curves | dict.fromkeys(names[:2], curve))
         assert "evaluations are random" not in text_of(page(contents_of(results_of_few, beside=[], suite=SUITE)))
 
