@@ -419,6 +419,12 @@ def test_groups_of_tasks_that_lose_alone_are_named():
     assert readings_of(worse([task.name for task in suite.core])) == []  # no group is spared
     ladder = next(ladder for ladder in suite.ladders if ladder.axis == "credit")
     assert readings_of(worse([task.name for task in ladder.tasks])) == ["credit"]
+    for names, start in (
+        (ladder.tasks[1:], "It may be healthy, but weaker: it"),
+        (ladder.tasks, "Something is wrong: it"),
+    ):
+        said = diagnosis_of_results(contents_of(worse([task.name for task in names], by=1.0))).verdict
+        assert said.startswith(start) and "on the axis of credit" in said
     # who fails on the lowest rung already, where rewards are small costs, say, lacks something else
     for names, signs in ((ladder.tasks, ()), (ladder.tasks[1:], ("gamma_half",))):
         (line,) = findings_of(contents_of(worse([task.name for task in names], by=1.0)))

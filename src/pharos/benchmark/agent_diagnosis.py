@@ -90,6 +90,8 @@ LOSS_SIGNS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "credit": ("look at gamma, lambda and returns of several steps", ("gamma_half",)),
 }
 """Groups of tasks and axes that one mistake hits: what to try, and the faults that they are a sign of."""
+ABILITIES = ("exploration", "estimation", "credit")
+"""Axes of LOSS_SIGNS: a healthy agent with a smaller network or other hyperparameters may lose on them alone."""
 WHERE = {"rewards of several sizes": "with rewards of several sizes", "ended by time alone": "ended by time alone"}
 """Groups by property, in words."""
 LEAST_REGRET, MOST_REGRET = -0.5, 1e6  # that a curve may have; what is evaluated by episodes may be below 0
@@ -318,7 +320,9 @@ def _verdict(diagnosis: Diagnosis) -> str:
         family, share = next(iter(families(shares).items()))
         near = f", and nearest to faults of {FAMILIES[family][0]}" if share > CREDIBLE else ""
         like = like or f"it is like none of the known faults{near}" * bool(shares and not diagnosis.from_results)
-        return f"Something is wrong: {diagnosis.findings[0].wrong}{'; ' * bool(like)}{like}."
+        is_weak = not fault and all(each.reading in ABILITIES and each.faults for each in diagnosis.findings)
+        start = "It may be healthy, but weaker" if is_weak else "Something is wrong"
+        return f"{start}: {diagnosis.findings[0].wrong}{'; ' * bool(like)}{like}."
     if fault:
         return f"No single number is unlike those of healthy agents, but {like}."
     if not diagnosis.from_results and diagnosis.score < BROKEN:
