@@ -120,7 +120,8 @@ def told(folder):
     tables = [compare_groups(ours, theirs, each) for each in kinds]
     own_words = [*seeds_sentence([contents.agent]), *random_play(ours), fall_everywhere(contents)]
     own_words += [*lowest_rungs(contents), *worst_groups(tables, groups, ours, theirs)]
-    own_words += [suspicion(ours, theirs, groups), *policy_sentences(contents)[:-1]]
+    own_words += [suspicion(ours, theirs, groups)]
+    own_words += [text for text in policy_sentences(contents) if not text.startswith("Deterministic")]
     residuals = [task.name for task, own, _ in residual_tasks(contents) if is_own(contents, task, own.value)]
     own_words += [f"Residuals of its own: {', '.join(residuals)}."] if residuals else []
     said = diagnosis_of_results(contents)

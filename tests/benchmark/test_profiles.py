@@ -416,7 +416,12 @@ def test_groups_of_tasks_that_lose_alone_are_named():
     vectors = [task.name for task in suite.core if task.observation == "vector"]
     assert readings_of(worse(vectors)) == ["vector"]
     assert readings_of(worse(vectors, by=1.0)) == ["vector"]  # of which one ends by time alone
-    assert readings_of(worse([task.name for task in suite.core])) == []  # no group is spared
+    assert readings_of(worse([task.name for task in suite.core])) == ["core"]  # no group is spared
+    # tasks that share no group, as those that a missing done mask loses
+    lost = ["breakout-5-3-1-hash", "frozen_lake-5-0-vector-random-0.1", "game_2048-2x2-to-32-one_hot"]
+    (line,) = findings_of(contents_of(worse(lost, by=1.0)))
+    assert line.reading == "core" and "terminal_bootstrapped" in line.faults
+    assert all(name in line.wrong for name in lost) and line.wrong.endswith("beside +0.01 on the others")
     ladder = next(ladder for ladder in suite.ladders if ladder.axis == "credit")
     assert readings_of(worse([task.name for task in ladder.tasks])) == ["credit"]
     for names, start in (

@@ -67,6 +67,7 @@ EXPLORER = (
     "Its values are those of the policy that explores, as of SARSA. If it ought to take the largest next value, this "
     "is a fault."
 )
+TASK_LOSS, MOST_TASKS = -0.3, 3  # of score, on a task that is named; tasks that are named
 IN_PLAY = 0.05  # of score, that is lost by chance in play
 LOSS_SIGNS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "vector": (
@@ -88,6 +89,10 @@ LOSS_SIGNS: Mapping[str, tuple[str, tuple[str, ...]]] = {
         ("replay_too_small", "learning_rate_high"),
     ),
     "credit": ("look at gamma, lambda and returns of several steps", ("gamma_half",)),
+    "core": (
+        "read in the report what failing these tasks means; where an end is what is lost, look at the done mask",
+        ("terminal_bootstrapped", "value_without_mask"),
+    ),
 }
 """Groups of tasks and axes that one mistake hits: what to try, and the faults that they are a sign of."""
 ABILITIES = ("exploration", "estimation", "credit")
@@ -443,6 +448,8 @@ def findings_of(contents: Contents) -> list[Finding]:
             where = f"core tasks {WHERE.get(name, f'seen as {name}')}"
             beside = "" if np.isnan(spared) else f", beside {spared:+.2f} on the others"
             findings += _loss(name, loss, f"{where}{beside}", other.name)
+    if not losses and comparison.core is not None and comparison.core.verdict == WORSE:
+        findings += _tasks_lost(contents, near[0], core)
     for axis, own in axes.items():
         if own.verdict != WORSE:
             continue
@@ -457,12 +464,27 @@ def findings_of(contents: Contents) -> list[Finding]:
     return findings
 
 
-def _loss(name: str, difference: float, where: str, other: str) -> list[Finding]:
-    if difference > -LOSS:
+def _tasks_lost(contents: Contents, index: int, core: Sequence[str]) -> list[Finding]:
+    """A finding if the core is worse by LOSS, or by half of it and tasks are lost: these, and what the others lose."""
+    other, comparison = contents.beside[index], contents.comparisons[index]
+    assert comparison.core is not None
+    loss = comparison.core.interval.value
+    differences = {name: comparison.tasks[name].interval.value for name in core if name in comparison.tasks}
+    lost = sorted((x, name) for name, x in differences.items() if x <= TASK_LOSS)[:MOST_TASKS]
+    if not lost:
+        return _loss("core", loss, "the core", other.name)
+    rest = outside(contents.agent.results, other.results, core, [name for _, name in lost])
+    shown = listed([f"{name} ({x:+.2f})" for x, name in lost])
+    beside = "" if np.isnan(rest) else f", beside {rest:+.2f} on the others"
+    return _loss("core", loss, f"the core, most on {shown}{beside}", other.name, LOSS / 2)
+
+
+def _loss(name: str, difference: float, where: str, other: str, least: float = LOSS) -> list[Finding]:
+    if difference > -least:
         return []
     advice, faults = LOSS_SIGNS[name]
     wrong = f"it scores {-difference:.2f} less than {other} on {where}"
-    return [Finding(name, difference, -LOSS, wrong, advice, -difference / LOSS, faults)]
+    return [Finding(name, difference, -least, wrong, advice, -difference / least, faults)]
 
 
 def _own_findings(contents: Contents) -> list[Finding]:
