@@ -2,24 +2,44 @@
 
     python benchmarks/fault_profiles.py --rounds 3
     python benchmarks/fault_profiles.py --rounds 2 --scores
+    python benchmarks/fault_profiles.py --read DIR
 
 Each round has all faults once, each with hyperparameters and seeds of its own, and three healthy agents of each kind.
 An agent takes about 6 s of a processor. Writes src/pharos/benchmark/data/fault_profiles.csv.
 
-With `--scores` it writes fault_scores.csv beside it: scores on some tasks of v1, for finished runs, of all but agents
+With `--read DIR` it runs nothing: of each finished run in a folder of DIR it prints what `compare`, the page and
+`diagnose` say, beside the shipped DQN, as a row of a table.
+
+With `--scores` it writes fault_scores.csv beside it: what a finished run has of some tasks of v1, of all but agents
 whose seeds are ignored, and of two healthy ones a round. An agent takes about 3 s a task.
 """
 
 import argparse
 import csv
 import zlib
+from pathlib import Path
 
 import numpy as np
 
 from pharos.benchmark import faults, load_suite
+from pharos.benchmark.agent_diagnosis import diagnosis_of_results
+from pharos.benchmark.comparison import WORSE, compare_groups
+from pharos.benchmark.contents import contents_of, residual_tasks
+from pharos.benchmark.diagnosis import (
+    fall_everywhere,
+    groups_of,
+    is_own,
+    lowest_rungs,
+    nearest,
+    policy_sentences,
+    random_play,
+    seeds_sentence,
+    suspicion,
+    worst_groups,
+)
 from pharos.benchmark.doctor import readings
 from pharos.benchmark.examination import NAMES, examine
-from pharos.benchmark.profiles import DECIMALS, PROFILES_FILE, SCORED_TASKS, SCORES
+from pharos.benchmark.profiles import DECIMALS, PROFILES_FILE, SCORED_TASKS, SCORES, run_readings
 from pharos.training.budget import generated_curve
 
 FURTHER = 100  # between numbers of the healthy agents of a round
@@ -59,19 +79,17 @@ def examinations(agent, fault, number):
 
 
 def scores(agent, fault, number):
-    """Scores of one agent on SCORED_TASKS, with one seed."""
-    suite, numbers = load_suite("v1"), {}
+    """Readings of one agent's runs of SCORED_TASKS, with one seed."""
+    suite, curves, policies = load_suite("v1"), {}, {}
     protocol = suite.protocol
     for name in SCORED_TASKS:
-        learn, task = (
-            faults.faulty_agent(agent, fault, **setting(agent, fault, number)),
-            suite.task(name).check(protocol),
-        )
+        learn = faults.faulty_agent(agent, fault, **setting(agent, fault, number))
         options = {"steps": protocol.steps, "evaluations": protocol.evaluations, "seed": 10 * number}
         with np.errstate(all="ignore"):
-            rows = generated_curve(learn, task, **options).rows[1:]
-        numbers[f"score_{name}"] = 1 - float(np.clip(np.mean([row["normalized_regret"] for row in rows]), 0, 1))
-    return numbers
+            curve = generated_curve(learn, suite.task(name).check(protocol), **options)
+        curves[name] = np.array([[row["normalized_regret"] for row in curve.rows[1:]]])
+        policies[name] = curve.policies
+    return run_readings(curves, policies)
 
 
 def write(rows, file=PROFILES_FILE):
@@ -86,11 +104,42 @@ def write(rows, file=PROFILES_FILE):
             table.writerow([agent, fault, *values])
 
 
+def told(folder):
+    """(difference on the core and each axis, sentences of the page, what diagnose says) of a finished run."""
+    contents = contents_of(folder, predictor="dqn")
+    ours, index = contents.agent.results, nearest(contents)[0]
+    comparison, theirs = contents.comparisons[index], contents.beside[index].results
+    differences = {"core": comparison.core, **{axis: each.score for axis, each in comparison.axes.items()}}
+    numbers = [
+        f"{name} {each.interval.value:+.2f}{' worse' * (each.verdict == WORSE)}"
+        for name, each in differences.items()
+        if each is not None
+    ]
+    kinds = groups_of(contents)
+    groups = {name: names for each in kinds for name, names in each.items()}
+    tables = [compare_groups(ours, theirs, each) for each in kinds]
+    own_words = [*seeds_sentence([contents.agent]), *random_play(ours), fall_everywhere(contents)]
+    own_words += [*lowest_rungs(contents), *worst_groups(tables, groups, ours, theirs)]
+    own_words += [suspicion(ours, theirs, groups)]
+    own_words += [text for text in policy_sentences(contents) if not text.startswith("Deterministic")]
+    residuals = [task.name for task, own, _ in residual_tasks(contents) if is_own(contents, task, own.value)]
+    own_words += [f"Residuals of its own: {', '.join(residuals)}."] if residuals else []
+    said = diagnosis_of_results(contents)
+    shares = ", ".join(f"{name} {share:.2f}" for name, share, _ in said.nearest())
+    others = "".join(f" {each.wrong}." for each in said.findings[1:])
+    return ", ".join(numbers), " ".join(filter(None, own_words)), f"{said.verdict}{others} Nearest: {shares}"
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--scores", action="store_true")
+    parser.add_argument("--read", type=Path, metavar="DIR")
     options, rows = parser.parse_args(), []
+    if options.read:
+        for folder in sorted(path for path in options.read.iterdir() if path.is_dir()):
+            print("|", " | ".join((folder.name, *told(folder))), "|", flush=True)
+        return
     for agent, fault, number in agents(range(options.rounds)):
         if options.scores and (fault == "seeds_ignored" or number >= 2 * FURTHER):
             continue

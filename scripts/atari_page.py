@@ -99,7 +99,7 @@ RUNS = "| game | agent | seeds | predicted, and its interval | observed: mean, l
 def write_runs(folder: Path) -> None:
     """runs.csv of the study, one row a finished run, and its table on the page."""
     rows = []
-    for file in sorted(folder.glob("*/run.json")):
+    for file in sorted(folder.rglob("run.json")):
         record = json.loads(file.read_text())
         if record["status"] == "finished":
             config, result = record["config"], record["result"]
@@ -113,16 +113,22 @@ def write_runs(folder: Path) -> None:
     before, _, rest = PAGE.read_text().partition(RUNS)
     after = rest.partition("\n\n")[2]
     with (STUDY / "predictions.csv").open() as stream:
-        lines = [line for cell in csv.DictReader(stream) if (line := line_of(cell, rows))]
+        cells = [cell for cell in csv.DictReader(stream) if regrets_of(cell, rows)]
+    lines = [line_of(cell, rows) for cell in cells]
+    held = sum(float(cell["low"]) <= np.mean(regrets_of(cell, rows)) <= float(cell["high"]) for cell in cells)
+    after = re.sub(r"\d+ of the \d+ intervals", f"{held} of the {len(cells)} intervals", after)
     PAGE.write_text("\n".join([before + RUNS, "|---" * RUNS.count(" | ") + "|---|", *lines, "", after]))
 
 
+def regrets_of(cell: dict[str, str], rows: list[list]) -> list[float]:
+    """Normalised regrets of the runs that a prediction was made for."""
+    return [float(row[3]) for row in rows if row[:2] == [cell["game"], cell["agent"]]]
+
+
 def line_of(cell: dict[str, str], rows: list[list]) -> str:
-    """The line of a game and an agent: prediction beside runs; empty if there is none."""
+    """The line of a game and an agent: prediction beside runs."""
     own = [row for row in rows if row[:2] == [cell["game"], cell["agent"]]]
-    if not own:
-        return ""
-    regrets, last = [float(row[3]) for row in own], [float(row[4]) / (float(row[6]) - float(row[7])) for row in own]
+    regrets, last = regrets_of(cell, rows), [float(row[4]) / (float(row[6]) - float(row[7])) for row in own]
     predicted = f"{float(cell['predicted_regret']):.2f} ({float(cell['low']):.2f} to {float(cell['high']):.2f})"
     observed = f"{np.mean(regrets):.2f} ({min(regrets):.2f} to {max(regrets):.2f})"
     return f"| `{cell['game']}` | {cell['agent']} | {len(own)} | {predicted} | {observed} | {np.mean(last):.2f} |"

@@ -9,9 +9,10 @@ import pytest
 from naive import benchmark as naive
 from pharos import benchmark
 from pharos.benchmark import AgentResults, compare, power
+from pharos.benchmark.agent_diagnosis import diagnosis_of_results
 from pharos.benchmark.comparison import compare_groups
-from pharos.benchmark.contents import contents_of, residual_tasks
-from pharos.benchmark.diagnosis import fall_everywhere, falls, groups_of, strengths, without_verdict
+from pharos.benchmark.contents import contents_of, residual_tasks, sentence
+from pharos.benchmark.diagnosis import fall_everywhere, falls, groups_of, strengths, suspicion, without_verdict
 from pharos.benchmark.page import page
 from pharos.benchmark.properties import known_properties, properties_of, purpose_of
 from pharos.benchmark.suite import BenchmarkTask, Ladder, Protocol, Suite
@@ -139,6 +140,9 @@ def test_who_fails_on_the_lowest_rung_is_told_that_it_is_no_matter_of_the_axis()
         "Fails on the lowest rung of exploration already, with a score of 0.20 (0.19 to 0.21) (DQN 1.00): not a" in text
     )
     assert "lowest rung of credit" not in text and "lowest rung of scale" not in text
+    assert sentence(own).startswith(
+        "mine fails on the lowest rung of exploration already (0.20 and DQN 1.00), assigns "
+    )
     rows = {row[0]: row[1:] for row in falls(own)}
     assert [float(rows[axis][1].split()[0]) for axis in AXES] == pytest.approx([0.15, 0.85, 0.4], abs=0.011)
     assert rows["credit"][2] == "1.00, 0.40"
@@ -236,6 +240,37 @@ def test_a_fault_of_one_group_of_tasks_has_its_name(group, number):
 
 
 @pytest.mark.long
+@pytest.mark.parametrize(("group", "table"), [("vector", "by property"), ("ended by time alone", "by what is seen")])
+def test_a_loss_of_tasks_that_two_groups_share_is_told_of_the_group_that_loses_without_the_other(group, table):
+    """A dropped feature costs a world that time ends, too, and a wrong time limit one that is seen as a vector."""
+    groups = {name: tasks for each in groups_of(contents_of("dqn")) for name, tasks in each.items()}
+    broken = lesioned(groups[group], by=1.0)
+    section = page(contents_of(broken)).split("Core tasks in groups, beside DQN")[1].split("</section>")[0]
+    said = re.search(rf"It is a loss on {group}: tasks of ([^<]+) without these have ([-+.0-9]+)\.", section)
+    assert said is not None and f"a loss on {said[1]}" not in section and table in section.split(said[0])[0]
+    {*groups[said[1]]} - {*groups[group]}
+    assert {*groups[said[1]]} & {*groups[group]} and abs(float(said[2])) < 0.02  # nothing was done to these
+
+
+@pytest.mark.long
+def test_a_loss_that_few_seeds_do_not_show_is_called_suspicious_and_an_equal_agent_is_not():
+    real = AgentResults.read("dqn")
+    groups = {name: tasks for each in groups_of(contents_of("dqn")) for name, tasks in each.items()}
+    raised = dict(zip(groups["ended by time alone"], ([0.6, 0.4, 0.2], [0.3, 0.5, 0.4]), strict=True))
+    few = {name: curve[:3] for name, curve in real.curves.items()}
+    broken = {name: np.minimum(few[name] + np.array(more)[:, None], 1) for name, more in raised.items()}
+    mine = replace(real, agent="my dqn", seeds=(0, 1, 2), curves={**few, **broken})
+    text = suspicion(mine, real, groups)
+    loss = compare_groups(mine, real, groups)["ended by time alone"]
+    assert loss.verdict == "not shown to differ" and loss.p_value < 0.05
+    assert text.startswith(f"Not shown, but suspicious: ended by time alone, {loss.interval.value:+.2f}, beside ")
+    assert text in page(contents_of(mine)) and diagnosis_of_results(contents_of(mine)).verdict.endswith(text)
+    assert suspicion(replace(mine, curves=few), real, groups) == ""
+    shown = {name: np.ones_like(few[name]) for name in groups["rewards of several sizes"]}
+    assert suspicion(replace(mine, curves={**few, **broken, **shown}), real, groups) == ""
+
+
+@pytest.mark.long
 def test_groups_have_the_difference_of_plain_python_and_holm_of_their_table():
     ours, theirs = AgentResults.read("dqn"), AgentResults.read("ppo")
     groups = groups_of(contents_of("dqn"))[0]
@@ -304,7 +339,7 @@ def test_the_kind_is_asked_for_where_the_name_does_not_say_it():
 def test_runs_without_a_policy_and_with_one_at_the_end_are_told():
     names = [task.name for task in SUITE.tasks]
     late = np.ones((5, 3)) - np.array([0.0, 0.0, 0.4])
-    for curve, sentence in (
+    for curve, text in (
         (np.ones((5, 3)), "In 40 of 60 runs all 3 evaluations are random play: was no policy yielded?"),
         (
             late,
@@ -312,7 +347,7 @@ def test_runs_without_a_policy_and_with_one_at_the_end_are_told():
         ),
     ):
         results_of_most = replace(HEALTHY, curves=HEALTHY.curves | dict.fromkeys(names[:8], curve))
-        assert sentence in text_of(page(contents_of(results_of_most, beside=[], suite=SUITE)))
+        assert text in text_of(page(contents_of(results_of_most, beside=[], suite=SUITE)))
         results_of_few = replace(HEALTHY, curves=HEALTHY.curves | dict.fromkeys(names[:2], curve))
         assert "evaluations are random" not in text_of(page(contents_of(results_of_few, beside=[], suite=SUITE)))
 

@@ -48,6 +48,10 @@ def test_there_are_two_dozen_faults_and_others_are_refused():
         faults.faulty_agent("dqm")
     with pytest.raises(UnknownName, match="gamma_half"):
         next(faults.ppo(None, 10, 0, fault="gamma_haf"))
+    # `--set fault=none` arrives as None
+    assert faults.faulty_agent("dqn", None).keywords == faults.faulty_agent("dqn").keywords == {"fault": faults.HEALTHY}
+    with pytest.raises(AttributeError, match="reset"):
+        next(faults.dqn(None, 10, 0, fault=None))
 
 
 @pytest.mark.long
@@ -70,6 +74,7 @@ def test_actions_are_shifted_and_drawn_when_it_is_judged():
     assert (faults.Greedy(network, "action_off_by_one")(x).argmax(axis=1) == (healthy(x).argmax(axis=1) + 1) % 3).all()
     drawn = faults.Greedy(network, "plays_at_random")(x)
     assert np.allclose(drawn.max(axis=1), 0.8 + 0.2 / 3) and np.allclose(drawn.sum(axis=1), 1)
+    assert np.allclose(faults.Greedy(network, "plays_at_random", 0.1)(x).max(axis=1), 0.9 + 0.1 / 3)
     other = x.copy()
     other[:, -1] = 9
     lost = faults.Greedy(network, "last_feature_lost")

@@ -70,6 +70,40 @@ def test_kernels_are_kept_by_their_texts_in_the_cache_alone(tmp_path):
     assert files == [{path.relative_to(place) for path in place.rglob("*")} for place in places]
 
 
+OF_TEXTS = """
+import sys
+import numpy as np
+from pharos.kernels.kernel_cache import cache_in, kernel
+from pathlib import Path
+
+@kernel
+def total(x):
+    return np.sort(x)[1:].sum()
+
+@kernel
+def place(text, part):
+    return hash(text), text.index(part)
+
+for each in (total, place):
+    each._cache = cache_in(Path(sys.argv[1]), each.__name__)
+print(total(np.array([3.0, 1.0, 2.0])), "numba.np.arraymath" in sys.modules, end=" ")
+print(place("abc", "b") == (hash("abc"), 1), sum(map(len, (total.stats.cache_hits, place.stats.cache_hits))), end=" ")
+try:
+    place("abc", "z")
+except ValueError as error:
+    print(error)
+"""
+
+
+@pytest.mark.slow
+def test_kernels_from_disk_do_the_same_without_the_parts_of_numba_that_compile(tmp_path):
+    there = os.environ | {"PYTHONPATH": str(PACKAGE.parent), "PYTHONHASHSEED": "random"}
+    words = [sys.executable, "-c", OF_TEXTS, str(tmp_path)]
+    first, second = (subprocess.check_output(words, env=there, text=True) for _ in range(2))
+    assert first == "5.0 True True 0 substring not found\n"
+    assert second == "5.0 False True 2 substring not found\n"
+
+
 def test_python_is_refused_by_a_function_of_kernels_alone():
     @called_by_kernels
     def twice(x):

@@ -13,11 +13,29 @@ from typing import Any
 import numpy as np
 
 from pharos.benchmark.comparison import LEAST_DIFFERENCE, WORSE, compare_groups
-from pharos.benchmark.contents import MOST_RECORD_LETTERS, Contents, Source, contents_of, listed, run_warnings
-from pharos.benchmark.diagnosis import ONE_ACTION, groups_of, nearest, policies_of, seeds_sentence
+from pharos.benchmark.contents import (
+    MOST_RECORD_LETTERS,
+    Contents,
+    Source,
+    contents_of,
+    fails_on_the_lowest_rung,
+    listed,
+    run_warnings,
+)
+from pharos.benchmark.diagnosis import (
+    LOSS,
+    ONE_ACTION,
+    groups_of,
+    is_of,
+    nearest,
+    outside,
+    policies_of,
+    seeds_sentence,
+    suspicion,
+)
 from pharos.benchmark.doctor import on_policy, readings
 from pharos.benchmark.examination import EXAMINATION_PROTOCOL, NAMES, Examination, examine
-from pharos.benchmark.faults import FAMILIES, FAULTS, HEALTHY
+from pharos.benchmark.faults import FAMILIES, FAULTS, HEALTHY, alike
 from pharos.benchmark.profiles import (
     BROKEN,
     CREDIBLE,
@@ -35,10 +53,11 @@ from pharos.benchmark.profiles import (
     judged,
     kind_of,
     likeness,
+    run_readings,
     shipped,
     suspect,
+    with_signs,
 )
-from pharos.benchmark.results import AgentResults
 from pharos.benchmark.scores import run_scores
 from pharos.benchmark.suite import Suite, load_suite
 from pharos.errors import ParameterError
@@ -48,7 +67,7 @@ EXPLORER = (
     "Its values are those of the policy that explores, as of SARSA. If it ought to take the largest next value, this "
     "is a fault."
 )
-LOSS = 0.1  # of score, on a group of tasks or an axis, that is a symptom
+TASK_LOSS, MOST_TASKS = -0.3, 3  # of score, on a task that is named; tasks that are named
 IN_PLAY = 0.05  # of score, that is lost by chance in play
 LOSS_SIGNS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "vector": (
@@ -70,8 +89,16 @@ LOSS_SIGNS: Mapping[str, tuple[str, tuple[str, ...]]] = {
         ("replay_too_small", "learning_rate_high"),
     ),
     "credit": ("look at gamma, lambda and returns of several steps", ("gamma_half",)),
+    "core": (
+        "read in the report what failing these tasks means; where an end is what is lost, look at the done mask",
+        ("terminal_bootstrapped", "value_without_mask"),
+    ),
 }
 """Groups of tasks and axes that one mistake hits: what to try, and the faults that they are a sign of."""
+ABILITIES = ("exploration", "estimation", "credit")
+"""Axes of LOSS_SIGNS: a healthy agent with a smaller network or other hyperparameters may lose on them alone."""
+WHERE = {"rewards of several sizes": "with rewards of several sizes", "ended by time alone": "ended by time alone"}
+"""Groups by property, in words."""
 LEAST_REGRET, MOST_REGRET = -0.5, 1e6  # that a curve may have; what is evaluated by episodes may be below 0
 
 
@@ -89,7 +116,7 @@ class Diagnosis:
         strange: whether it is farther from all known faults, and from health, than known ones are.
         accuracy: how often the likeness was right for agents that the library did not have.
         scores: by world, or by task of a finished run: 1 optimal and 0 as uniform play, mean of the seeds.
-        readings: all numbers, see `doctor.readings`. Of a finished run see `score_readings`.
+        readings: all numbers, see `doctor.readings`. Of a finished run see `run_readings`.
         on_policy: whether its values are those of the policy that explores, as of SARSA. If so, `readings` are by what
             was played, not by the largest next value. It is no fault of a learner on-policy.
         from_results: whether it is the diagnosis of a finished run.
@@ -126,10 +153,10 @@ class Diagnosis:
         right = self.accuracy
         if right.agents and self.from_results:
             return (
-                f"By scores on {pluralize(len(SCORED_TASKS), 'task')} alone. Of {right.agents} agents of one author, "
-                f"each left out of the table in turn, the fault was the likeliest for {right.first:.0%}, among three "
-                f"for {right.three:.0%}; health was the likeliest for {right.healthy:.0%} of the healthy ones. "
-                "It is right less often for other code. Values say more: `pharos diagnose AGENT`."
+                f"By what was learnt on {pluralize(len(SCORED_TASKS), 'task')} alone. Of {right.agents} agents of one "
+                f"author, each left out of the table in turn, the fault was the likeliest for {right.first:.0%}, "
+                f"among three for {right.three:.0%}; health was the likeliest for {right.healthy:.0%} of the healthy "
+                f"ones. {self._alike}It is right less often for other code. Values say more: `pharos diagnose AGENT`."
             )
         if not right.agents:
             return "The table has one agent with each fault, so nothing is known of how often the likeness is right."
@@ -138,6 +165,19 @@ class Diagnosis:
             f"{right.first:.0%}, among three for {right.three:.0%}; {right.healthy:.0%} of the healthy ones were "
             f"called healthy. If all agents with a fault were left out, the answer was none of the known ones, or the "
             f"right family, for {right.unknown:.0%}."
+        )
+
+    @property
+    def _alike(self) -> str:
+        """A sentence on the faults that a finished run hardly tells from the likeliest, or empty."""
+        group = alike(self.kind, next(iter(self.likeness), ""))
+        if len(group) == 1:
+            return ""
+        names = listed(["healthy" if name == HEALTHY else name for name in group])
+        share = sum(self.likeness[name] for name in group)
+        return (
+            f"A run hardly tells {names} apart, so read them as one ({share:.2f}): the likeliest group was right for "
+            f"{self.accuracy.alike:.0%}. "
         )
 
     @property
@@ -285,7 +325,9 @@ def _verdict(diagnosis: Diagnosis) -> str:
         family, share = next(iter(families(shares).items()))
         near = f", and nearest to faults of {FAMILIES[family][0]}" if share > CREDIBLE else ""
         like = like or f"it is like none of the known faults{near}" * bool(shares and not diagnosis.from_results)
-        return f"Something is wrong: {diagnosis.findings[0].wrong}{'; ' * bool(like)}{like}."
+        is_weak = not fault and all(each.reading in ABILITIES and each.faults for each in diagnosis.findings)
+        start = "It may be healthy, but weaker" if is_weak else "Something is wrong"
+        return f"{start}: {diagnosis.findings[0].wrong}{'; ' * bool(like)}{like}."
     if fault:
         return f"No single number is unlike those of healthy agents, but {like}."
     if not diagnosis.from_results and diagnosis.score < BROKEN:
@@ -302,10 +344,10 @@ def diagnosis_of_results(contents: Contents) -> Diagnosis:
     _check_curves(contents)
     scores = {name: float(runs.mean()) for name, runs in run_scores(results).items()}
     findings = sorted(findings_of(contents), key=lambda each: -each.strength)
-    numbers, lacks = score_readings(results), missing_tasks(contents)
+    numbers, lacks = run_readings(results.curves, policies_of(results)), missing_tasks(contents)
     answer = Judgement(tuple(findings), {}, None, False)
     if not lacks:
-        shares = likeness(numbers, library_of(kind, SCORES))
+        shares = with_signs(likeness(numbers, library_of(kind, SCORES)), findings)
         signs = {fault for each in findings for fault in each.faults}
         fault = next((each for each in [suspect(shares)] if each in signs), None)
         findings.sort(key=lambda each: fault not in each.faults)
@@ -321,10 +363,20 @@ def diagnosis_of_results(contents: Contents) -> Diagnosis:
         for text in (*seeds_sentence([contents.agent]), *run_warnings(results))
         if "first policy came after" not in text
     ]
-    trusted = accuracy(kind or "dqn", SCORES)
-    return _diagnosis(
+    trusted = accuracy(kind or "dqn", SCORES, frozenset(numbers))
+    diagnosis = _diagnosis(
         contents.agent.name, kind, mistakes, answer, trusted, scores, numbers, from_results=True, lacks=lacks
     )
+    hint = "" if diagnosis.findings else _suspicion_of(contents)
+    return replace(diagnosis, verdict=f"{diagnosis.verdict} {hint}".strip())
+
+
+def _suspicion_of(contents: Contents) -> str:
+    """A sentence on a loss that too few seeds show, or empty, see `suspicion`."""
+    if (near := nearest(contents)) is None:
+        return ""
+    by_seen, by_property = groups_of(contents)
+    return suspicion(contents.agent.results, contents.beside[near[0]].results, {**by_seen, **by_property})
 
 
 def _check_curves(contents: Contents) -> None:
@@ -341,15 +393,6 @@ def _check_curves(contents: Contents) -> None:
                 f"results of {contents.agent.name}: {name} has normalised regret of {curve.min():.3g} to "
                 f"{curve.max():.3g}; expected 0, optimal, to {MOST_REGRET:g}; take the file as it was written"
             )
-
-
-def score_readings(results: AgentResults) -> dict[str, float]:
-    """Numbers of a finished run that are held against those of known faults: scores on SCORED_TASKS that it has.
-
-    `score_` and the name of the task, the mean of its seeds.
-    """
-    scores = run_scores(results)
-    return {f"score_{name}": float(scores[name].mean()) for name in SCORED_TASKS if name in scores}
 
 
 def missing_tasks(contents: Contents) -> str:
@@ -375,7 +418,7 @@ def findings_of(contents: Contents) -> list[Finding]:
     findings = _own_findings(contents)
     if (near := nearest(contents)) is None:
         return findings
-    other, comparison = contents.beside[near[0]], contents.comparisons[near[0]]
+    ours, other, comparison = contents.agent.results, contents.beside[near[0]], contents.comparisons[near[0]]
     below = [name for name in contents.agent.score.below_random if name not in other.score.below_random]
     if len(below) * 4 >= len(contents.agent.score.tasks):
         wrong = (
@@ -394,25 +437,54 @@ def findings_of(contents: Contents) -> list[Finding]:
         return [*findings, Finding("everywhere", 1.0, 0.0, wrong, advice, 10.0, FAMILIES["updates"][1])]
     by_seen, by_property = groups_of(contents)
     groups = {**by_seen, **by_property}
-    core = {name for names in by_seen.values() for name in names}
-    for name, each in compare_groups(contents.agent.results, other.results, groups).items():
-        rest = compare_groups(contents.agent.results, other.results, {"": sorted(core - {*groups[name]})})
-        spared = rest[""].interval.value if rest else 0.0
-        if name in LOSS_SIGNS and each.verdict == WORSE and spared > each.interval.value / 2:
-            where = f"core tasks with {name}" if name in by_property else f"core tasks seen as {name}"
-            findings += _loss(name, each.interval.value, f"{where}, beside {spared:+.2f} on the others", other.name)
+    core = sorted(name for names in by_seen.values() for name in names)
+    losses: dict[str, float] = {}  # the largest first
+    for name, each in sorted(compare_groups(ours, other.results, groups).items(), key=lambda i: i[1].interval.value):
+        loss, spared = each.interval.value, outside(ours, other.results, core, groups[name])
+        if name not in LOSS_SIGNS or each.verdict != WORSE or spared <= loss / 2:
+            continue
+        if not any(is_of(loss, outside(ours, other.results, groups[name], groups[more])) for more in losses):
+            losses[name] = loss
+            where = f"core tasks {WHERE.get(name, f'seen as {name}')}"
+            beside = "" if np.isnan(spared) else f", beside {spared:+.2f} on the others"
+            findings += _loss(name, loss, f"{where}{beside}", other.name)
+    if not losses and comparison.core is not None and comparison.core.verdict == WORSE:
+        findings += _tasks_lost(contents, near[0], core)
     for axis, own in axes.items():
-        if own.verdict == WORSE:
-            findings += _loss(axis, own.interval.value, f"the axis of {axis}", other.name)
+        if own.verdict != WORSE:
+            continue
+        rung, others = contents.agent.score.axes[axis], other.score.axes[axis]
+        lines = _loss(axis, own.interval.value, f"the axis of {axis}", other.name)
+        if lines and fails_on_the_lowest_rung(rung) and not fails_on_the_lowest_rung(others):
+            scores = f"{rung.lowest.value:.2f}, {other.name} {others.lowest.value:.2f}"
+            wrong = f"{lines[0].wrong}, whose lowest rung it fails already ({scores}): not a matter of {axis}"
+            advice = "look for a bug in rewards and updates first"
+            lines = [replace(lines[0], wrong=wrong, advice=advice, strength=0.0, faults=())]
+        findings += lines
     return findings
 
 
-def _loss(name: str, difference: float, where: str, other: str) -> list[Finding]:
-    if difference > -LOSS:
+def _tasks_lost(contents: Contents, index: int, core: Sequence[str]) -> list[Finding]:
+    """A finding if the core is worse by LOSS, or by half of it and tasks are lost: these, and what the others lose."""
+    other, comparison = contents.beside[index], contents.comparisons[index]
+    assert comparison.core is not None
+    loss = comparison.core.interval.value
+    differences = {name: comparison.tasks[name].interval.value for name in core if name in comparison.tasks}
+    lost = sorted((x, name) for name, x in differences.items() if x <= TASK_LOSS)[:MOST_TASKS]
+    if not lost:
+        return _loss("core", loss, "the core", other.name)
+    rest = outside(contents.agent.results, other.results, core, [name for _, name in lost])
+    shown = listed([f"{name} ({x:+.2f})" for x, name in lost])
+    beside = "" if np.isnan(rest) else f", beside {rest:+.2f} on the others"
+    return _loss("core", loss, f"the core, most on {shown}{beside}", other.name, LOSS / 2)
+
+
+def _loss(name: str, difference: float, where: str, other: str, least: float = LOSS) -> list[Finding]:
+    if difference > -least:
         return []
     advice, faults = LOSS_SIGNS[name]
     wrong = f"it scores {-difference:.2f} less than {other} on {where}"
-    return [Finding(name, difference, -LOSS, wrong, advice, -difference / LOSS, faults)]
+    return [Finding(name, difference, -least, wrong, advice, -difference / least, faults)]
 
 
 def _own_findings(contents: Contents) -> list[Finding]:

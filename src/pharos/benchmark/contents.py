@@ -23,7 +23,16 @@ from pharos.benchmark.comparison import (
     suite_of_results,
 )
 from pharos.benchmark.results import RESULTS_FILE, AgentResults, baselines
-from pharos.benchmark.scores import BenchmarkScore, ConfidenceInterval, as_one_run, run_regrets, run_scores, score
+from pharos.benchmark.scores import (
+    CROSSING,
+    AxisScore,
+    BenchmarkScore,
+    ConfidenceInterval,
+    as_one_run,
+    run_regrets,
+    run_scores,
+    score,
+)
 from pharos.benchmark.suite import BenchmarkTask, Suite
 from pharos.errors import ParameterError
 from pharos.plots import agent_label
@@ -156,17 +165,26 @@ def regret_of(agent: ScoredAgent, task: BenchmarkTask) -> ConfidenceInterval | N
     return None if own is None else ConfidenceInterval(1 - own.value, 1 - own.high, 1 - own.low)
 
 
+def fails_on_the_lowest_rung(own: AxisScore) -> bool:
+    """Whether regret on the first rung is above 0.5 by its whole interval. Not for memory, which that rung asks for."""
+    return own.axis != "memory" and not math.isnan(own.lowest.low) and own.lowest.high < CROSSING
+
+
 def sentence(contents: Contents) -> str:
-    """Sentence on what the agent can do, in units: a frontier for each axis, with the baselines' frontiers."""
+    """Sentence on what the agent can do, in units: a frontier for each axis, with the baselines' frontiers.
+
+    Of an axis whose lowest rung it fails it has no such unit, so the scores there are said.
+    """
     clauses = []
     for axis, own in contents.agent.score.axes.items():
         if math.isnan(own.frontier.value):  # of one rung
             continue
-        others = [
-            f"{each.name} {frontier_text(each.score.axes[axis].frontier, interval=False)}"
-            for each in contents.beside
-            if axis in each.score.axes
-        ]
+        beside = [(each.name, each.score.axes[axis]) for each in contents.beside if axis in each.score.axes]
+        if fails_on_the_lowest_rung(own):
+            scores = listed([f"{own.lowest.value:.2f}", *(f"{name} {each.lowest.value:.2f}" for name, each in beside)])
+            clauses.append(f"fails on the lowest rung of {axis} already ({scores})")
+            continue
+        others = [f"{name} {frontier_text(each.frontier, interval=False)}" for name, each in beside]
         text, ends = _split(frontier_text(own.frontier, own.unit))
         inside = "; ".join(part for part in (ends, ", ".join(others)) if part)
         clauses.append(f"{PHRASES.get(axis, axis + ':')} {text}{f' ({inside})' if inside else ''}")

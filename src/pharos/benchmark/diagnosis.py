@@ -18,11 +18,13 @@ from pharos.benchmark.comparison import (
     AxisComparison,
     Comparison,
     Difference,
+    compare_groups,
 )
 from pharos.benchmark.contents import (
     PREDICTOR_PHRASES,
     Contents,
     ScoredAgent,
+    fails_on_the_lowest_rung,
     learner_kind,
     listed,
     number,
@@ -32,12 +34,15 @@ from pharos.benchmark.contents import (
 from pharos.benchmark.levels import twins
 from pharos.benchmark.properties import known_properties
 from pharos.benchmark.results import AgentResults, baselines
-from pharos.benchmark.scores import CROSSING, AxisScore, ConfidenceInterval, equal_seeds, run_scores
+from pharos.benchmark.scores import ConfidenceInterval, equal_seeds, run_scores
 from pharos.benchmark.suite import BenchmarkTask
 from pharos.system.wording import pluralize
 
 SHIPPED = {"dqn": ("dqn",), "ppo": ("ppo",), "table": ("q_learning",), "both": ("dqn", "ppo")}
 OWN_RESIDUAL = 0.1  # by which the regret of a residual is above the regret of the shipped agent of the kind
+LOSS = 0.1  # of score, on a group of tasks or an axis, that is a symptom
+SUSPECTS = frozenset({"vector", "simple_image", "rewards of several sizes", "ended by time alone"})
+"""Groups of tasks that one mistake hits."""
 ONE_ACTION = 0.9  # share of states in which a policy prefers the same action, to be told so
 SHOWN_TASKS = 5  # names of tasks in a sentence
 VERDICTS = (WORSE, BETTER, NEGLIGIBLE, NOT_SHOWN_TO_DIFFER)
@@ -111,11 +116,6 @@ def fall_everywhere(contents: Contents) -> str:
         f"Falls everywhere: the core and all {len(ladders_of(contents.comparisons[near[0]]))} axes are below "
         f"{contents.beside[near[0]].name}'s. Look for a bug first; axes say nothing before it is mended."
     )
-
-
-def fails_on_the_lowest_rung(own: AxisScore) -> bool:
-    """Whether regret on the first rung is above 0.5 by its whole interval. Not for memory, which that rung asks for."""
-    return own.axis != "memory" and not math.isnan(own.lowest.low) and own.lowest.high < CROSSING
 
 
 def lowest_rungs(contents: Contents) -> list[str]:
@@ -193,16 +193,79 @@ def groups_of(contents: Contents) -> tuple[dict[str, list[str]], dict[str, list[
     return by_observation, {group: names for kind in kinds if len(kind) > 1 for group, names in sorted(kind.items())}
 
 
-def worst_groups(groups: Mapping[str, Difference]) -> str:
-    """A sentence on the group with the largest significant loss, if others are shown to lose less than half of it."""
-    losses = {name: each.interval.value for name, each in groups.items() if each.verdict == WORSE}
-    if not losses:
+def outside(ours: AgentResults, theirs: AgentResults, group: Sequence[str], other: Sequence[str]) -> float:
+    """Difference of the mean scores on the tasks of a group that another group lacks. NaN if it has all or none."""
+    rest = sorted({*group} - {*other})
+    if not rest or len(rest) == len({*group}):
+        return math.nan
+    differences = compare_groups(ours, theirs, {"": rest})
+    return differences[""].interval.value if differences else math.nan
+
+
+def is_of(loss: float, outside_of_it: float) -> bool:
+    """Whether a loss on a group is that of another group: less than half of it is left outside of the other one."""
+    return outside_of_it > loss / 2
+
+
+def worst_groups(
+    tables: Sequence[Mapping[str, Difference]],
+    groups: Mapping[str, Sequence[str]],
+    ours: AgentResults,
+    theirs: AgentResults,
+) -> list[str]:
+    """For each table a sentence on the group with the largest significant loss, if others are shown to lose less than
+    half of it, else an empty one.
+
+    Groups of two tables share tasks. So if the loss is that of the other table's group, this is said.
+    """
+    worst = [_worst_of(table) for table in tables]
+    texts = []
+    for own, table in zip(worst, tables, strict=True):
+        loss = table[own].interval.value if own else 0.0
+        spared = [name for name, each in table.items() if each.interval.low > loss / 2]
+        if not own or not spared:
+            texts.append("")
+            continue
+        text = f"The largest loss is on {own}, {loss:+.2f}. Less than half of that on {listed(spared)}."
+        for other, table_of_other in zip(worst, tables, strict=True):
+            if other and other != own:
+                rest = outside(ours, theirs, groups[own], groups[other])
+                back = outside(ours, theirs, groups[other], groups[own])
+                if is_of(loss, rest) and not is_of(table_of_other[other].interval.value, back):
+                    text += f" It is a loss on {other}: tasks of {own} without these have {rest:+.2f}."
+        texts.append(text)
+    return texts
+
+
+def suspicion(ours: AgentResults, theirs: AgentResults, groups: Mapping[str, Sequence[str]]) -> str:
+    """A sentence on the group of SUSPECTS that loses most, if too few seeds show it: 0.05 before Holm's correction.
+
+    The loss is LOSS or more, and other tasks lose less than half of it. Empty if some group of SUSPECTS is shown to
+    lose, or none is suspicious.
+    """
+    differences = compare_groups(ours, theirs, groups)
+    every = sorted({name for names in groups.values() for name in names})
+    suspects = []
+    for name in SUSPECTS.intersection(differences):
+        each = differences[name]
+        rest = outside(ours, theirs, every, groups[name])
+        if each.verdict == WORSE:
+            return ""
+        if each.verdict == NOT_SHOWN_TO_DIFFER and each.interval.high < 0 and each.interval.value <= -LOSS:
+            suspects += [(each.interval.value, name, rest)] * is_of(each.interval.value, rest)
+    if not suspects:
         return ""
-    worst = min(losses, key=losses.__getitem__)
-    spared = [name for name, each in groups.items() if each.interval.low > losses[worst] / 2]
-    if not spared:
-        return ""
-    return f"The largest loss is on {worst}, {losses[worst]:+.2f}. Less than half of that on {listed(spared)}."
+    loss, name, rest = min(suspects)
+    return (
+        f"Not shown, but suspicious: {name}, {loss:+.2f}, beside {rest:+.2f} on the other tasks. "
+        f"{pluralize(len(ours.seeds), 'seed')} are too few to tell; run more."
+    )
+
+
+def _worst_of(table: Mapping[str, Difference]) -> str:
+    """The group with the largest significant loss, or empty."""
+    losses = {name: each.interval.value for name, each in table.items() if each.verdict == WORSE}
+    return min(losses, key=losses.__getitem__) if losses else ""
 
 
 def shipped_regret(contents: Contents, task: BenchmarkTask) -> float | None:

@@ -1,4 +1,4 @@
-"""Faults that people faulty_agent in agents, each a switch of a small DQN or PPO: what `pharos diagnose` knows.
+"""Faults that people make in agents, each a switch of a small DQN or PPO: what `pharos diagnose` knows.
 
     pharos diagnose pharos.benchmark.faults:dqn --set fault=target_never_copied
     pharos benchmark run --agent pharos.benchmark.faults:ppo --set fault=gamma_half --out results/fault
@@ -73,9 +73,26 @@ FAMILIES = {
     "seeds": ("random numbers", ("seeds_ignored",)),
 }
 """Families of faults: name -> what they are about, and which."""
+ALIKE = {
+    "dqn": (
+        (HEALTHY, "bytes_not_divided", "epsilon_stuck", "replay_too_small", "truncation_as_end"),
+        ("last_feature_lost", "terminal_bootstrapped"),
+        ("learning_rate_high", "frames_reshaped"),
+        ("target_never_copied", "next_is_observation", "learning_rate_low", "gamma_half", "rewards_shifted"),
+    ),
+    "ppo": ((HEALTHY, "truncation_as_end"),),
+}
+"""Faults by agent that a finished run hardly tells apart, nor from health. Each other one is alone."""
 
 
-def faulty_agent(agent: str, fault: str = HEALTHY, **hyperparameters: Any) -> partial[Iterator["Greedy | Stochastic"]]:
+def alike(agent: str, fault: str) -> tuple[str, ...]:
+    """The faults that a finished run of an agent hardly tells from a fault, which is among them."""
+    return next((group for group in ALIKE.get(agent, ()) if fault in group), (fault,))
+
+
+def faulty_agent(
+    agent: str, fault: str | None = HEALTHY, **hyperparameters: Any
+) -> partial[Iterator["Greedy | Stochastic"]]:
     """The agent "dqn" or "ppo" with a fault, as learn(env, steps, seed), which `benchmark.run` and `diagnose` take.
 
     Args:
@@ -86,14 +103,17 @@ def faulty_agent(agent: str, fault: str = HEALTHY, **hyperparameters: Any) -> pa
     """
     if agent not in FAULTS:
         raise UnknownName("agent with faults", agent, FAULTS)
-    _check(agent, fault)
+    fault = _checked(agent, fault)
     learn: Any = {"dqn": dqn, "ppo": ppo}[agent]
     return partial(learn, fault=fault, **hyperparameters)
 
 
-def _check(agent: str, fault: str) -> None:
+def _checked(agent: str, fault: str | None) -> str:
+    """The fault, if the agent has it. None is healthy: so the command line reads `--set fault=none`."""
+    fault = HEALTHY if fault is None else fault
     if fault != HEALTHY and fault not in FAULTS[agent]:
         raise UnknownName(f"fault of {agent}", fault, [HEALTHY, *FAULTS[agent]])
+    return fault
 
 
 class SmallNetwork:
@@ -168,8 +188,8 @@ def batch_of(rows: np.ndarray, fault: str) -> np.ndarray:
 class Greedy:
     """Greedy policy of a network of values of actions; `q_values(observations)` is (N, A)."""
 
-    def __init__(self, network: SmallNetwork, fault: str):
-        self.network, self.fault = network.copy(), fault
+    def __init__(self, network: SmallNetwork, fault: str, random_play: float = 0.2):
+        self.network, self.fault, self.random_play = network.copy(), fault, random_play
 
     def q_values(self, observations: npt.ArrayLike) -> np.ndarray:
         return self.network(batch_of(encoded(observations, self.fault), self.fault))
@@ -178,25 +198,29 @@ class Greedy:
         q = self.q_values(observations)
         probabilities = np.eye(q.shape[1])[q.argmax(axis=1)]
         if self.fault == "plays_at_random":
-            probabilities = 0.8 * probabilities + 0.2 / q.shape[1]
+            probabilities = (1 - self.random_play) * probabilities + self.random_play / q.shape[1]
         return np.roll(probabilities, self.fault == "action_off_by_one", axis=1)
 
 
-def dqn(
+def dqn(  # noqa: PLR0913  (its hyperparameters)
     env: Any,
     steps: int,
     seed: int,
     *,
-    fault: str = HEALTHY,
+    fault: str | None = HEALTHY,
     width: int = 32,
     learning_rate: float = 0.001,
     gamma: float = 0.95,
     batch_size: int = 32,
     target_interval: int = 200,
     final_epsilon: float = 0.05,
+    random_play: float = 0.2,
 ) -> Iterator[Greedy]:
-    """DQN with a fault of DQN_FAULTS; it yields its greedy policy ten times, and at the end."""
-    _check("dqn", fault)
+    """DQN with a fault of DQN_FAULTS; it yields its greedy policy ten times, and at the end.
+
+    `random_play` is the share of random actions of the fault plays_at_random.
+    """
+    fault = _checked("dqn", fault)
     seed = 0 if fault == "seeds_ignored" else seed
     rng = np.random.default_rng(seed)
     rate = learning_rate * {"learning_rate_high": 100, "learning_rate_low": 0.01}.get(fault, 1)
@@ -237,7 +261,7 @@ def dqn(
         if step % target_interval == 0 and fault != "target_never_copied":
             target = network.copy()
         if (step + 1) % max(1, steps // 10) == 0 or step + 1 == steps:
-            yield Greedy(network, fault)
+            yield Greedy(network, fault, random_play)
 
 
 class Stochastic:
@@ -265,7 +289,7 @@ def ppo(  # noqa: PLR0913  (its hyperparameters)
     steps: int,
     seed: int,
     *,
-    fault: str = HEALTHY,
+    fault: str | None = HEALTHY,
     width: int = 32,
     learning_rate: float = 0.001,
     gamma: float = 0.95,
@@ -278,7 +302,7 @@ def ppo(  # noqa: PLR0913  (its hyperparameters)
     gae_lambda: float = 0.95,
 ) -> Iterator[Stochastic]:
     """PPO with a fault of PPO_FAULTS; it yields its policy after each rollout."""
-    _check("ppo", fault)
+    fault = _checked("ppo", fault)
     rng = np.random.default_rng(seed)
     rate = learning_rate * (100 if fault == "learning_rate_high" else 1)
     gamma = 0.5 if fault == "gamma_half" else gamma

@@ -66,6 +66,7 @@ from pharos.benchmark.diagnosis import (
     seeds_sentence,
     shipped_regret,
     strengths,
+    suspicion,
     without_verdict,
     worst_groups,
 )
@@ -124,7 +125,8 @@ def _lead(contents: Contents) -> list[Element]:
     if broken := fall_everywhere(contents):
         lines.append(element("p", broken, class_="warning"))
     core = f"Core score {number(own.core)} on {pluralize(contents.num_run(contents.suite.core), 'task')}"
-    core += "".join(f"; {each.name} {each.score.core.value:.2f}" for each in contents.beside if each.score.has_core)
+    compared = zip(contents.beside, contents.comparisons, strict=True)  # on the tasks that both have run
+    core += "".join(f"; {each.name} {both.core.theirs:.2f}" for each, both in compared if both.core is not None)
     rest = {"Final score": own.final, "interquartile mean": own.iqm}
     parts = [*(f"{name} {number(interval)}" for name, interval in rest.items()), unclipped_regret(contents)]
     scale = "A score is 1 for the optimal policy and 0 for random play. Intervals are of 95 %, over seeds."
@@ -304,10 +306,13 @@ def _gaps(contents: Contents) -> Element | None:
 def _groups(contents: Contents) -> Element | None:
     if (near := nearest(contents)) is None:
         return None
-    other = contents.beside[near[0]]
+    ours, other = contents.agent.results, contents.beside[near[0]]
+    by_seen, by_property = groups_of(contents)
+    groups = {**by_seen, **by_property}
+    tables = [compare_groups(ours, other.results, each) for each in (by_seen, by_property)]
+    texts = worst_groups(tables, groups, ours, other.results)
     parts = []
-    for caption, groups in zip(("by what is seen", "by property"), groups_of(contents), strict=True):
-        differences = compare_groups(contents.agent.results, other.results, groups)
+    for caption, differences, text in zip(("by what is seen", "by property"), tables, texts, strict=True):
         if len(differences) < 2:
             continue
         rows: list[list[str | Element]] = []
@@ -317,8 +322,9 @@ def _groups(contents: Contents) -> Element | None:
             rows.append([group, str(len(groups[group])), *scores, signed(each.interval), bar, each.verdict])
         heads = [caption, "tasks", "score", other.name, "difference", "", "verdict"]
         parts.append(html_table(heads, rows, numeric=(1, 2, 3, 4)))
-        if text := worst_groups(differences):
-            parts.append(element("p", text))
+        parts += [element("p", text)] if text else []
+    if parts and (text := suspicion(ours, other.results, groups)):
+        parts.append(element("p", text))
     if not parts:
         return None
     return section(

@@ -6,21 +6,21 @@ extreme healthy agents in it, with a margin, so that no healthy agent of the tab
 The likeness of a fault is its probability by linear discriminant analysis among all faults of the agent's kind. An
 agent that is far from all of them is like none of the known ones.
 
-`data/fault_scores.csv` has the scores of the same agents on `SCORED_TASKS` of the suite v1, for finished runs.
+`data/fault_scores.csv` has the `run_readings` of the same agents on `SCORED_TASKS` of the suite v1, for finished runs.
 
 Source: Friedman (1989), Regularized discriminant analysis.
 """
 
 import csv
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from pharos.benchmark.doctor import EQUATIONS
-from pharos.benchmark.faults import FAMILIES, HEALTHY
+from pharos.benchmark.faults import FAMILIES, HEALTHY, alike
 
 PROFILES_FILE = Path(__file__).parent / "data" / "fault_profiles.csv"
 SCORES = PROFILES_FILE.with_name("fault_scores.csv")
@@ -31,6 +31,8 @@ SCORED_TASKS = (
     "umbrella_chain-22-hash",
 )
 """Tasks of the suite v1 whose scores tell faults apart."""
+LAST_THIRD = 1 / 3  # of the evaluations, that `late_` is about
+SIGN = 3.0  # times as likely as before is a fault that a finding is a sign of
 DECIMALS = 3
 LARGEST = 4.0  # deviations within a fault that a reading counts as being away
 DIAGONAL_WEIGHT = 0.5  # weight of the deviations alone in the covariance within a fault
@@ -360,6 +362,33 @@ def shipped(file: Path = PROFILES_FILE) -> tuple[Profile, ...]:
         )
 
 
+def run_readings(curves: Mapping[str, np.ndarray], policies: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
+    """Numbers of a finished run that are held against those of known faults.
+
+    Args:
+        curves: (runs, evaluations) normalised regret of each task.
+        policies: facts on the policies of each task, see `training.policy_facts`, means over its runs.
+    Returns:
+        Of each of SCORED_TASKS that was run `score_` and its name, and `late_`, the same of the last third of the
+        evaluations. Means over them: `worse`, regret beyond that of uniform play in the last third, at most 1. If
+        there are facts on the policies of all of them, `one_action` and `deterministic`.
+    """
+    names = [name for name in SCORED_TASKS if name in curves]
+    late = {name: curves[name][:, -round(curves[name].shape[1] * LAST_THIRD) :].mean(axis=1) for name in names}
+    numbers = {f"score_{name}": _score(curves[name].mean(axis=1)) for name in names}
+    numbers |= {f"late_{name}": _score(late[name]) for name in names}
+    if names:
+        numbers["worse"] = float(np.mean([np.clip(late[name] - 1, 0, 1).mean() for name in names]))
+    if names and all(name in policies for name in names):
+        for fact in ("one_action", "deterministic"):
+            numbers[fact] = float(np.mean([policies[name][fact] for name in names]))
+    return numbers
+
+
+def _score(regrets: np.ndarray) -> float:
+    return float(np.mean(1 - np.clip(regrets, 0, 1)))
+
+
 def kind_of(numbers: Mapping[str, float]) -> str:
     """Kind of agent: "dqn" if the readings are of values of actions, "ppo" if of values of states, empty if of none."""
     if "consistency" not in numbers:
@@ -464,6 +493,7 @@ class Accuracy:
         healthy: share of healthy ones without a symptom and without a fault that is likely.
         unknown: share of agents whose whole fault was left out for which the answer was none of the known ones, or
             another fault of the same family.
+        alike: share of agents with a fault for which it was in the likeliest group of `faults.ALIKE`.
     """
 
     agents: int
@@ -471,6 +501,15 @@ class Accuracy:
     three: float
     healthy: float
     unknown: float
+    alike: float
+
+
+def with_signs(shares: Mapping[str, float], findings: Sequence["Finding"]) -> dict[str, float]:
+    """Likeness of faults, of which those that a finding is a sign of count SIGN times, the largest first."""
+    signs = {fault for each in findings for fault in each.faults}
+    weights = {fault: share * (SIGN if fault in signs else 1.0) for fault, share in shares.items()}
+    total = sum(weights.values())
+    return {fault: weights[fault] / total for fault in sorted(weights, key=lambda fault: -weights[fault])}
 
 
 def suspect(shares: Mapping[str, float]) -> str | None:
@@ -480,10 +519,17 @@ def suspect(shares: Mapping[str, float]) -> str | None:
 
 
 @cache
-def accuracy(kind: str, file: Path = PROFILES_FILE) -> Accuracy:
-    """Accuracy of a shipped library for a kind of agent: each of its agents is left out in turn, then its fault."""
-    library = [each for each in shipped(file) if each.kind == kind]
-    ranks, healthy, unknown = [], [], []
+def accuracy(kind: str, file: Path = PROFILES_FILE, names: frozenset[str] | None = None) -> Accuracy:
+    """Accuracy of a shipped library for a kind of agent: each of its agents is left out in turn, then its fault.
+
+    By the readings `names` alone, if they are given.
+    """
+    library = [
+        replace(each, readings={name: x for name, x in each.readings.items() if names is None or name in names})
+        for each in shipped(file)
+        if each.kind == kind
+    ]
+    ranks, healthy, unknown, in_group = [], [], [], []
     for index, each in enumerate(library):
         rest = library[:index] + library[index + 1 :]
         if each.fault not in {other.fault for other in rest}:
@@ -494,14 +540,18 @@ def accuracy(kind: str, file: Path = PROFILES_FILE) -> Accuracy:
             healthy.append(is_healthy if file == PROFILES_FILE else next(iter(answer.shares)) == HEALTHY)
             continue
         ranks.append([*answer.shares].index(each.fault))
+        groups = {alike(kind, fault): 0.0 for fault in answer.shares}
+        for fault, share in answer.shares.items():
+            groups[alike(kind, fault)] += share
+        in_group.append(each.fault in max(groups, key=groups.__getitem__))
         answer = judged(each.readings, [other for other in rest if other.fault != each.fault])
         own = {fault for _, faults in FAMILIES.values() if each.fault in faults for fault in faults}
         is_right = answer.fault in own if answer.fault else bool(answer.findings) or answer.is_strange
         unknown.append(is_right if file == PROFILES_FILE else next(iter(answer.shares)) in own)
     rank = np.array(ranks)
     if not ranks or not healthy:
-        return Accuracy(0, *[float("nan")] * 4)
-    shares = (rank == 0).mean(), (rank < 3).mean(), np.mean(healthy), np.mean(unknown)
+        return Accuracy(0, *[float("nan")] * 5)
+    shares = (rank == 0).mean(), (rank < 3).mean(), np.mean(healthy), np.mean(unknown), np.mean(in_group)
     return Accuracy(len(ranks) + len(healthy), *map(float, shares))
 
 

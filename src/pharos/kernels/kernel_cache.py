@@ -29,6 +29,7 @@ from numba.core.serialize import dumps
 from pharos.system import storage
 from pharos.system.compiling import private_folder
 
+libraries: Any = None
 if (0, 61) <= numba.version_info.short <= (0, 68):  # with which it was tried; any other compiles in its own way
     with contextlib.suppress(ImportError, AttributeError):
         from pharos.kernels import libraries
@@ -84,7 +85,6 @@ class KernelCache(NullCache):
 
     def load_overload(self, sig: object, target_context: TargetContext) -> CompileResult | None:
         """The compiled kernel of a signature. None if there is none, or a damaged one, which is deleted."""
-        target_context.refresh()
         file = self._file(sig, target_context.codegen())
         try:
             data = file.read_bytes()
@@ -93,6 +93,10 @@ class KernelCache(NullCache):
         try:
             if hashlib.sha256(data[DIGEST_BYTES:]).digest() != data[:DIGEST_BYTES]:
                 raise ValueError("it was changed after it was written")
+            if libraries is None:
+                target_context.refresh()
+            else:
+                libraries.prepare(target_context, data)
             return CompileResult._rebuild(target_context, *pickle.loads(data[DIGEST_BYTES:]))
         except Exception:  # whatever is wrong with it: the kernel is compiled again
             with contextlib.suppress(OSError):
@@ -103,7 +107,7 @@ class KernelCache(NullCache):
         """Write a compiled kernel to disk. Without room for it, the next process compiles again."""
         if cres.lifted or cres.library.has_dynamic_globals:  # it refers to addresses of this process
             return
-        data = dumps(cres._reduce())
+        data = dumps(cres._reduce() if libraries is None else libraries.reduced(cres))
         file = self._file(sig, cres.codegen)
         with contextlib.suppress(OSError):
             storage.replace_file(file, hashlib.sha256(data).digest() + data, durable=False)

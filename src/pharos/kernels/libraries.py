@@ -5,13 +5,17 @@ Then it links it into its callers, which are optimised and translated as a whole
 asks for its address, as Python does for a kernel. Nobody asks for most. Functions of Numba's library, such as `max`,
 have no ways in. Settings of the compiler, which are compared at each call, are compared by what is not the default.
 
+A function that is loaded from disk waits for no part of Numba that only compiling needs: the types and translations of
+what compiled code may call, of NumPy and of Python, half of Numba's import.
+
 All this holds for everything that the process compiles, and changes no result.
 """
 
 import numba
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Flags
-from numba.core.environment import lookup_environment
+from numba.core.compiler import CompileResult, Flags
+from numba.core.cpu import CPUContext
+from numba.core.environment import Environment, lookup_environment
 from numba.core.registry import cpu_target
 from numba.core.runtime import rtsys
 from numba.core.typing.templates import _OverloadFunctionTemplate
@@ -78,6 +82,29 @@ def install() -> None:
     _OverloadFunctionTemplate._get_jit_decorator = without_ways_in
     Flags.__eq__ = lambda one, other: isinstance(other, Flags) and _settings(one) == _settings(other)
     Flags.__hash__ = lambda one: hash(frozenset(_settings(one)))
+
+
+def prepare(target_context: CPUContext, data: bytes) -> None:
+    """Load what a compiled function from disk needs. One that hashes texts needs the process's own secret as well."""
+    if b"_numba_hashsecret" in data:
+        target_context.refresh()
+    else:
+        rtsys.initialize(target_context)
+
+
+def reduced(result: CompileResult) -> tuple:
+    """Parts of a compiled function that go to disk. The names of Numba's modules, whose functions are part of it, do
+    not: nobody asks for them, and they would be imported."""
+    *parts, environments = result._reduce()
+    return *parts, tuple(map(_without_module, environments))
+
+
+def _without_module(environment: Environment) -> Environment:
+    if not environment.globals["__name__"].startswith("numba."):
+        return environment
+    copy = Environment(vars(numba))
+    copy.consts[:], copy.env_name = environment.consts, environment.env_name
+    return copy
 
 
 def _settings(flags: Flags) -> dict[str, object]:

@@ -79,7 +79,7 @@ class Search:
         self.rules, self.threads = self._rules.first_exploration, 1
         # states that are interpreted: all those of a small space, none if compiled rules are loaded
         self._interpreted = 0 if self._rules.is_ready else compiling.SMALL_STATES // 4 // self.branches // 8 * 8
-        self.chunk = max(8, min(CHUNK, self._interpreted // 64 * 8))
+        self.chunk = max(8, min(CHUNK, self._interpreted // 192 * 8))
         self.position = Position()
         margin = 32 * self.branches + len(self.plan.starts[0])
         self.table = MemoryTable(self.num_words, margin, options.memory)
