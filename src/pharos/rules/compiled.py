@@ -7,7 +7,7 @@ that fails.
 import time
 from collections.abc import Callable
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -98,7 +98,7 @@ class CompiledExpansion(_Compiled):
         """Whether threads are worth the compiling of their kernels, if those are not on disk: after a while."""
         if compiling.SMALL_STATES == 0 or time.process_time() - self._began >= ALONE_SECONDS:
             return True
-        kernel = self.kernels.expand_and_find
+        kernel: Any = self.kernels.expand_and_find
         return bool(kernel.signatures) or is_on_disk(kernel)
 
     def explore(self, states, successors, terminal, probabilities, table, base, last, room, progress) -> None:
