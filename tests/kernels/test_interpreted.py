@@ -3,12 +3,15 @@
 import hashlib
 import importlib
 import json
+import math
 import os
 import pickle
 import pkgutil
 import subprocess
 import sys
+from itertools import product
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +19,9 @@ from numba.core.registry import CPUDispatcher
 
 import pharos
 from pharos import hardness, kernels, solvers
+from pharos.rules.compiled import CompiledExpansion
 from pharos.rules.interpreted import InterpretedExpansion
+from pharos.rules.layout import layout_of
 from pharos.system import compiling
 
 TESTS = Path(__file__).parents[1]
@@ -78,7 +83,10 @@ def test_interpreted_kernels_give_the_bits_of_compiled_ones(tmp_path):
     code = f"""
 import pickle, sys
 from pathlib import Path
+from types import SimpleNamespace
+from pharos.rules.compiled import CompiledExpansion
 from pharos.rules.interpreted import InterpretedExpansion
+from pharos.rules.layout import layout_of
 from pharos.system import compiling
 compiling.SMALL_STATES = 1 << 24
 import test_interpreted
@@ -135,3 +143,15 @@ def test_rules_that_are_compiled_already_are_hardly_interpreted_again(tmp_path, 
     monkeypatch.setattr("pharos.rules.rules.explored", set())  # as in another process, which finds them on disk
     space = pharos.build(env, tmp_path / "third", progress=False)
     assert 0 < sum(asked) < compiling.SMALL_STATES // 16 // space.num_actions < space.num_states
+
+
+def test_threads_wait_for_work_that_is_worth_their_kernel_unless_that_is_compiled(monkeypatch):
+    env = pharos.make("frozen_lake/4x4")
+    expansion = CompiledExpansion(env, layout_of(env.components))
+    assert expansion.threads(2) == 2  # nothing is interpreted in this process
+    monkeypatch.setattr(compiling, "SMALL_STATES", 100)
+    monkeypatch.setattr("pharos.rules.compiled.is_on_disk", lambda kernel: kernel.is_on_disk)
+    for signatures, is_on_disk, began in product(([], [1]), (False, True), (-math.inf, math.inf)):
+        kernel = SimpleNamespace(signatures=signatures, is_on_disk=is_on_disk)
+        expansion.kernels, expansion._began = SimpleNamespace(expand_and_find=kernel), began
+        assert expansion.threads(2) == (2 if signatures or is_on_disk or began < 0 else 1)

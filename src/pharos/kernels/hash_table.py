@@ -496,27 +496,3 @@ def place_again(entries, old, low, high):
         if old[i, words] > 0:
             slot, _ = _slot_for(entries, keys, i)
             _enter(entries, slot, keys, i, old[i, words])
-
-
-# States as words ------------------------------------------------------------------------------------------------------
-
-
-@interpreted_first("states")
-@kernel
-def pack_rows(word, shift, low, states, packed):
-    """packed (N, W) uint64 |= states (N, D) int64, component i in bits from shift[i] of word[i].
-
-    `packed` is zero before.
-    """
-    for n in range(len(states)):
-        for i in range(len(word)):
-            packed[n, word[i]] |= np.uint64(states[n, i] - low[i]) << shift[i]
-
-
-@interpreted_first("states")
-@kernel
-def unpack_rows(word, shift, mask, low, packed, states):
-    """states (N, D) int64 = components of packed (N, W), the inverse of `pack_rows`."""
-    for n in range(len(packed)):
-        for i in range(len(word)):
-            states[n, i] = np.int64((packed[n, word[i]] >> shift[i]) & mask[i]) + low[i]

@@ -96,7 +96,7 @@ class KernelCache(NullCache):
             if libraries is None:
                 target_context.refresh()
             else:
-                libraries.prepare(target_context, data)
+                libraries.get_ready(target_context, data)
             return CompileResult._rebuild(target_context, *pickle.loads(data[DIGEST_BYTES:]))
         except Exception:  # whatever is wrong with it: the kernel is compiled again
             with contextlib.suppress(OSError):

@@ -84,7 +84,7 @@ def install() -> None:
     Flags.__hash__ = lambda one: hash(frozenset(_settings(one)))
 
 
-def prepare(target_context: CPUContext, data: bytes) -> None:
+def get_ready(target_context: CPUContext, data: bytes) -> None:
     """Load what a compiled function from disk needs. One that hashes texts needs the process's own secret as well."""
     if b"_numba_hashsecret" in data:
         target_context.refresh()

@@ -4,9 +4,10 @@ Each class compiles its kernels in its constructor, by calling them with no work
 that fails.
 """
 
+import time
 from collections.abc import Callable
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from pharos.errors import RuleError
 from pharos.kernels.kernel_cache import is_on_disk
 from pharos.rules.compiler import Function, compiler_of, numeric_attributes, type_text
 from pharos.rules.layout import Layout
+from pharos.system import compiling
 from pharos.system.arrays import Indices, PackedIndices
 
 if TYPE_CHECKING:
@@ -27,6 +29,9 @@ NO_RANKS = np.empty(0, np.int64)
 
 explored: set[type[Environment]] = set()
 """Classes by whose rules this process explores compiled."""
+
+ALONE_SECONDS = 2.0
+"""Seconds of the processor after which threads are worth their kernels, which take 0.9 s to compile."""
 
 _SUSPECTS = 16  # states of which a kernel cannot say in which one a rule failed
 
@@ -84,9 +89,17 @@ class CompiledExpansion(_Compiled):
         states = np.empty((1, layout.num_words), np.uint64)
         rows = (np.empty((1, branches), np.int32), np.empty(1, np.uint8), np.empty((1, branches)))
         self.explore(states, *rows, np.full(1 << 16, -1, np.int32), 0, 0, 0, np.zeros(5, np.int64))
+        self._began = time.process_time()
 
     def threads(self, workers: int) -> int:
-        return workers
+        return workers if self._is_worth_sharing() else 1
+
+    def _is_worth_sharing(self) -> bool:
+        """Whether threads are worth the compiling of their kernels, if those are not on disk: after a while."""
+        if compiling.SMALL_STATES == 0 or time.process_time() - self._began >= ALONE_SECONDS:
+            return True
+        kernel: Any = self.kernels.expand_and_find
+        return bool(kernel.signatures) or is_on_disk(kernel)
 
     def explore(self, states, successors, terminal, probabilities, table, base, last, room, progress) -> None:
         rows = self._rows(terminal, probabilities)

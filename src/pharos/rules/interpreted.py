@@ -14,8 +14,8 @@ import numpy as np
 
 from pharos.environments import Environment
 from pharos.errors import RuleError
-from pharos.kernels.hash_table import COUNT, FIRST, find_states, insert_missing, pack_rows, slots_of, unpack_rows
-from pharos.rules.layout import Layout, unpack_states
+from pharos.kernels.hash_table import COUNT, FIRST, find_states, insert_missing, slots_of
+from pharos.rules.layout import Layout, pack_states, unpack_states
 from pharos.system.arrays import SUM_TOLERANCE
 from pharos.system.workers import without_interrupts
 
@@ -271,13 +271,10 @@ class InterpretedExpansion:
     def _expand(self, states: np.ndarray, keys: np.ndarray, terminal: np.ndarray, probabilities: np.ndarray) -> None:
         """Successors of packed states to keys, packed. Terminal states and impossible outcomes lead to the state."""
         layout = self.layout
-        unpacked = np.empty((len(states), len(layout.word)), np.int64)
-        unpack_rows(layout.word, layout.shift, layout.mask, layout.low, states, unpacked)
-        next_states, terminal[:], p = self._branches(unpacked)
+        next_states, terminal[:], p = self._branches(unpack_states(layout, states))
         if p is not None:
             probabilities[:] = p
-        keys[:] = 0
-        pack_rows(layout.word, layout.shift, layout.low, next_states, keys)
+        keys[:] = pack_states(layout, next_states)
 
     def _branches(self, states: np.ndarray) -> Branches:
         return self._interpreters.branches(states)

@@ -126,12 +126,12 @@ class Search:
         return not self.in_memory or first >= self._interpreted or (first > 0 and self._rules.is_kept)
 
     def _compile(self) -> None:
-        """Continue with compiled rules, by larger chunks."""
+        """Continue with compiled rules, by larger chunks, and by several threads once those are worth their kernels."""
         if self.rules is self._rules.first_exploration:
             self.rules = self._rules.exploration
-            self.threads = self.rules.threads(self.workers)
             max_branches = CHUNK_OUTCOMES if self.env.has_chance else CHUNK_SUCCESSORS
             self.chunk, self._blocks = min(CHUNK, max(8, max_branches // self.branches // 8 * 8)), []
+        self.threads = self.rules.threads(self.workers)
 
     @property
     def in_memory(self) -> bool:
