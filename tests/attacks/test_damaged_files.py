@@ -453,10 +453,15 @@ def test_results_that_are_diagnosed_and_are_others(finished, tmp_path, count):
     assert tally.counts["refused"] == tally.total, tally.failures
     values = [value for value in (*NUMBERS, *OTHERS) if value == value and value not in (np.inf, "\ud800")]
     same = repr([True, True, True])
+    sealed(record={"record": {**record["record"], "policies": {}}})
+    without, whole_said = diagnosed(tmp_path / "r"), whole  # facts on policies that cannot be read are none
+    assert without["scores"] == whole["scores"] and without["readings"].items() < whole["readings"].items()
     for name, value in itertools.product(record["record"], values[::2]):
+        whole = without if name == "policies" else whole_said
         with suppress(ValueError):  # no file has such a number
             sealed(record={"record": {**record["record"], name: value}})
             tally.note(f"{name} {str(value)[:20]}", *outcome(read, (same,)))
+    whole = whole_said
     for name, value in itertools.product(("one_action", "deterministic", "greedy_score"), (-1, 1e300, "x", None, 2)):
         facts = {each: {**own, name: value} for each, own in record["record"]["policies"].items()}
         sealed(record={"record": {**record["record"], "policies": facts}})

@@ -367,8 +367,8 @@ def test_a_finished_run_is_like_the_known_agents_with_its_readings():
             shares = right.first, right.three, right.healthy, right.unknown
             row = f"| {kind.upper()}, {len(words) - (kind == 'dqn')} faults{more} | {right.agents} | "
             assert row + " | ".join(f"{100 * share:.0f} %" for share in shares) + " |" in PAGE
-            assert right.alike >= right.first
-    groups = [accuracy(kind, SCORES).alike for kind in FAULTS]
+            assert right.group >= right.first
+    groups = [accuracy(kind, SCORES).group for kind in FAULTS]
     assert f"likeliest for {groups[0]:.0%} of DQNs with a fault, and for {groups[1]:.0%} of PPOs" in WORDS
 
 
@@ -386,6 +386,11 @@ def test_a_likeness_of_scores_says_a_fault_only_beside_a_sign_of_it():
     assert next(iter(diagnosis_of_results(contents_of(whole)).likeness)) == "rewards_clipped"
     for said in map(diagnosis_of_results, map(contents_of, (whole, as_known(each, "my ppo")))):
         assert said.fault in (None, *(fault for finding in said.findings for fault in finding.faults))
+    everywhere = replace(as_known(each, "my dqn"), curves=worse([task.name for task in load_suite("v1").tasks]).curves)
+    lost = next(each for each in shipped(SCORES) if each.fault == "next_is_observation")
+    curves = {**everywhere.curves, **{name: as_known(lost, "").curves[name] for name in SCORED_TASKS}}
+    said = diagnosis_of_results(contents_of(replace(everywhere, curves=curves, record=as_known(lost, "").record)))
+    assert said.fault == "next_is_observation" and "a run hardly tells target_never_copied, next_is_" in said.verdict
 
 
 def test_a_run_without_the_tasks_of_the_table_names_the_command_that_has_the_likeness():

@@ -67,7 +67,7 @@ EXPLORER = (
     "Its values are those of the policy that explores, as of SARSA. If it ought to take the largest next value, this "
     "is a fault."
 )
-TASK_LOSS, MOST_TASKS = -0.3, 3  # of score, on a task that is named; tasks that are named
+TASK_LOSS, MOST_LOST = -0.3, 3  # of score, on a task that is named; tasks that are named
 IN_PLAY = 0.05  # of score, that is lost by chance in play
 LOSS_SIGNS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "vector": (
@@ -177,7 +177,7 @@ class Diagnosis:
         share = sum(self.likeness[name] for name in group)
         return (
             f"A run hardly tells {names} apart, so read them as one ({share:.2f}): the likeliest group was right for "
-            f"{self.accuracy.alike:.0%}. "
+            f"{self.accuracy.group:.0%}. "
         )
 
     @property
@@ -321,6 +321,9 @@ def _diagnosis(
 def _verdict(diagnosis: Diagnosis) -> str:
     fault, shares = diagnosis.fault, diagnosis.likeness
     like = f"it is most like an agent in which {meanings(diagnosis.kind)[fault]} ({shares[fault]:.2f})" if fault else ""
+    if fault and diagnosis.from_results and len(group := alike(diagnosis.kind, fault)) > 1:
+        names = listed(["a healthy one" if name == HEALTHY else name for name in group])
+        like += f"; a run hardly tells {names} apart"
     if diagnosis.findings:
         family, share = next(iter(families(shares).items()))
         near = f", and nearest to faults of {FAMILIES[family][0]}" if share > CREDIBLE else ""
@@ -470,7 +473,7 @@ def _tasks_lost(contents: Contents, index: int, core: Sequence[str]) -> list[Fin
     assert comparison.core is not None
     loss = comparison.core.interval.value
     differences = {name: comparison.tasks[name].interval.value for name in core if name in comparison.tasks}
-    lost = sorted((x, name) for name, x in differences.items() if x <= TASK_LOSS)[:MOST_TASKS]
+    lost = sorted((x, name) for name, x in differences.items() if x <= TASK_LOSS)[:MOST_LOST]
     if not lost:
         return _loss("core", loss, "the core", other.name)
     rest = outside(contents.agent.results, other.results, core, [name for _, name in lost])

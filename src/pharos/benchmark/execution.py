@@ -25,7 +25,7 @@ from pharos.benchmark.scores import AxisScore, BenchmarkScore, ConfidenceInterva
 from pharos.benchmark.suite import CORE, EARLIER, BenchmarkTask, Suite, load_suite
 from pharos.errors import AllRunsFailed, FolderLocked, ParameterError, PharosError, UnknownName
 from pharos.system import storage
-from pharos.system.wording import in_one_line
+from pharos.system.wording import in_one_line, pluralize
 from pharos.system.workers import usable_workers
 from pharos.training import versions
 
@@ -231,7 +231,7 @@ def collected(folder: Path, form: Form, suite: Suite, record: Mapping[str, Any],
         facts.setdefault(task, []).append(result.policies)
     whole = {task: np.stack(each) for task, each in curves.items() if len(each) == len(seeds)}
     if (text := equal_seeds(whole)) and form.learns:
-        notes["equal seeds"] = {f"{len(whole)} tasks": text}
+        notes["equal seeds"] = {pluralize(len(whole), "task"): text}
     full_record = {**record, "exact": {task: exact[task] for task in whole}, "steps_used": steps}
     policies = {task: mean_facts(facts[task], whole[task]) for task in whole if all(facts[task])}
     optional = {"failed": missing, "notes": notes, "policies": policies}

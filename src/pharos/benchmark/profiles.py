@@ -493,7 +493,7 @@ class Accuracy:
         healthy: share of healthy ones without a symptom and without a fault that is likely.
         unknown: share of agents whose whole fault was left out for which the answer was none of the known ones, or
             another fault of the same family.
-        alike: share of agents with a fault for which it was in the likeliest group of `faults.ALIKE`.
+        group: share of agents with a fault for which it was in the likeliest group of `faults.ALIKE`.
     """
 
     agents: int
@@ -501,7 +501,7 @@ class Accuracy:
     three: float
     healthy: float
     unknown: float
-    alike: float
+    group: float
 
 
 def with_signs(shares: Mapping[str, float], findings: Sequence["Finding"]) -> dict[str, float]:
