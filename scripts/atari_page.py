@@ -18,6 +18,7 @@ import numpy as np
 
 import pharos
 from pharos import drawing, hardness, importers
+from pharos.statistics import spearman
 
 PAGE = Path(__file__).parents[1] / "docs" / "atari.md"
 GAMES = {  # horizon, and other options of the import
@@ -115,9 +116,22 @@ def write_runs(folder: Path) -> None:
     with (STUDY / "predictions.csv").open() as stream:
         cells = [cell for cell in csv.DictReader(stream) if regrets_of(cell, rows)]
     lines = [line_of(cell, rows) for cell in cells]
-    held = sum(float(cell["low"]) <= np.mean(regrets_of(cell, rows)) <= float(cell["high"]) for cell in cells)
-    after = re.sub(r"\d+ of the \d+ intervals", f"{held} of the {len(cells)} intervals", after)
+    after = re.sub(r"Of DQN's intervals .*?\n\n", lambda _: agreement(cells, rows) + "\n\n", after, flags=re.DOTALL)
     PAGE.write_text("\n".join([before + RUNS, "|---" * RUNS.count(" | ") + "|---|", *lines, "", after]))
+
+
+def agreement(cells: list[dict[str, str]], rows: list[list]) -> str:
+    """How many intervals hold the mean of the runs, and the rank correlation of both, in words."""
+    held, ranks = [], []
+    for agent in ("dqn", "ppo"):
+        own = [(cell, np.mean(regrets_of(cell, rows))) for cell in cells if cell["agent"] == agent]
+        held.append(f"{sum(float(cell['low']) <= mean <= float(cell['high']) for cell, mean in own)} of {len(own)}")
+        predicted = [float(cell["predicted_regret"]) for cell, _ in own]
+        ranks.append(spearman(np.array(predicted), np.array([mean for _, mean in own])))
+    return (
+        f"Of DQN's intervals {held[0]} hold the mean of the runs, with a rank correlation of {ranks[0]:.2f}. Of PPO's\n"
+        f"{held[1]} hold it, with a rank correlation of {ranks[1]:.2f}."
+    )
 
 
 def regrets_of(cell: dict[str, str], rows: list[list]) -> list[float]:
