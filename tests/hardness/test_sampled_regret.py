@@ -11,16 +11,16 @@ import pharos
 from naive import learning as naive_learning
 from pharos import hardness
 from pharos.errors import ParameterError, UndefinedMeasure
-from pharos.hardness import Representation, Sampling, Schedule, sampled_regret
+from pharos.hardness import Network, Representation, Sampling, Schedule, huber_regret, sampled_regret, tangent_kernel
 from pharos.hardness.representation.learning import Exact, Identity, Landmarks
-from pharos.hardness.representation.sampled_regret import SampledLearner
+from pharos.hardness.representation.sampled_regret import HuberLearner, SampledLearner
 from pharos.mdp import TabularMDP, lazy_actions, paid_outcomes, random_actions, sticky_actions
 
 SHORT = Schedule(steps=700, period=50, gradient_steps=13, learning_starts=60, gamma=0.9)
 ONCE = Sampling(walks=1, batch_size=8, buffer_size=150)
 
 
-def plain_walk(mdp, kernel, classes, schedule, sampling, episode, steps):
+def plain_walk(mdp, kernel, classes, schedule, sampling, episode, steps, start=0.0, largest_error=math.inf):
     """Q (C, A) after so many steps of the first walk: the definition in plain Python, with the same random numbers."""
     words = np.random.SeedSequence(sampling.seed, spawn_key=(2,)).generate_state(2, np.uint64)
     rng, noises = naive_learning.SplitMix64(words[0]), naive_learning.SplitMix64(words[1])
@@ -31,7 +31,7 @@ def plain_walk(mdp, kernel, classes, schedule, sampling, episode, steps):
     cumulative = np.cumsum(mdp.start_probabilities)
     cumulative[-1] = 1.0
     C = max(classes) + 1
-    Q, visits, memory = np.zeros((C, A)), np.zeros((C, A)), []
+    Q, visits, memory = np.zeros((C, A)) + start, np.zeros((C, A)), []
     target, state, previous, elapsed, largest_step = Q.copy(), None, None, 0, 0.0
     ends = schedule.exploration_fraction * schedule.steps
     for t in range(steps):
@@ -95,7 +95,8 @@ def plain_walk(mdp, kernel, classes, schedule, sampling, episode, steps):
             ]
             step = min(largest_step, 1 / max(likeness)) / len(batch)
             for (x, a, *_), error in zip(batch, errors, strict=True):
-                Q[:, a] += step * error * np.asarray(kernel[x], np.float64)
+                cut = error if abs(error) <= largest_error else math.copysign(largest_error, error)
+                Q[:, a] += step * cut * np.asarray(kernel[x], np.float64)
     return Q
 
 
@@ -107,16 +108,18 @@ class Precise(Exact):
         return float(np.linalg.eigvalsh(root * np.asarray(self.matrix, np.float64) * root.T)[-1])
 
 
-def both_walks(mdp, kernel, classes, sampling, *, schedule=SHORT, episode=7, operator=None):
+def both_walks(mdp, kernel, classes, sampling, *, schedule=SHORT, episode=7, operator=None, of=SampledLearner):
     """Q (C, A) of the first walk, compiled and plain; kernel (S, S), classes (S,)."""
-    learner = SampledLearner(mdp, Representation.of_matrix(kernel, classes), schedule, episode)
+    seen = Representation.of_matrix(kernel, classes, covariance=lambda x, y: kernel[np.ix_(x, y)] / 50)
+    learner = of(mdp, seen, schedule, episode)
     learner.sampling, observations = sampling, learner.observations
     some, number = observations.representatives, np.zeros(mdp.num_states, np.int64)
     number[learner.numbers] = observations.groups
     operator = operator or Precise(lambda x, y: kernel[np.ix_(x, y)], some)
     *_, compiled = learner.walk(observations, operator, np.array([0, schedule.steps]), sampling.seed)
     part = kernel[np.ix_(some, some)]
-    return compiled, plain_walk(mdp, part, number.tolist(), schedule, sampling, episode, schedule.steps)
+    more = learner.start(observations, sampling.seed).T, learner.largest_error
+    return compiled, plain_walk(mdp, part, number.tolist(), schedule, sampling, episode, schedule.steps, *more)
 
 
 WORLDS = {
@@ -263,3 +266,73 @@ def test_what_it_is_not_defined_for_is_said():
     idle = TabularMDP.from_arrays([[1, 1], [-1, -1]], [[0.0, 0.0], [1.0, 1.0]], gamma=1.0, horizon=3)
     with pytest.raises(UndefinedMeasure, match="uniform play is optimal"):
         sampled_regret(idle, Representation.of_matrix(np.eye(2)))
+
+
+# With the Huber loss, from a random network ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["plain", "both"])
+def test_a_walk_with_the_huber_loss_from_a_drawn_start_is_the_definition(name):
+    mdp = WORLDS[name]().with_rewards(8 * WORLDS[name]().rewards)  # so that many errors are cut
+    kernel = np.asarray(kernel_of(mdp.num_states), np.float32)
+    compiled, plain = both_walks(mdp, kernel, np.arange(mdp.num_states), ONCE, of=HuberLearner)
+    squared, _ = both_walks(mdp, kernel, np.arange(mdp.num_states), ONCE)
+    np.testing.assert_allclose(compiled, plain, rtol=1e-9, atol=1e-9 * np.abs(plain).max())
+    assert not np.allclose(compiled, squared, rtol=0.01)
+
+
+def seen_with(kernel, covariance):
+    return Representation.of_matrix(kernel, covariance=lambda rows, columns: covariance[np.ix_(rows, columns)])
+
+
+def test_a_walk_starts_from_the_gaussian_process_each_action_for_itself():
+    covariance = np.asarray(kernel_of(7), np.float64)
+    learner = HuberLearner(random_mdp(7, 3), seen_with(kernel_of(7), covariance), SHORT, 7)
+    part = covariance[np.ix_(learner.observations.representatives, learner.observations.representatives)]
+    starts = np.array([learner.start(learner.observations, seed) for seed in range(4000)])
+    scale = np.sqrt(np.outer(np.diag(part), np.diag(part)))
+    for a in range(starts.shape[1]):
+        np.testing.assert_allclose(starts[:, a].T @ starts[:, a] / 4000 / scale, part / scale, atol=0.07)
+    assert np.abs(starts[:, 0].T @ starts[:, 1] / 4000 / scale).max() < 0.07
+    assert not learner.start(learner.table, 0).any()
+
+
+def test_the_covariance_of_outputs_is_that_of_random_networks():
+    rng, x = np.random.default_rng(0), np.random.default_rng(1).random((4, 3))
+    outputs = []
+    for _ in range(3000):  # PyTorch's layers: uniform within 1 / sqrt(inputs)
+        values = x
+        for inputs, units in ((3, 64), (64, 48), (48, 1)):
+            weight, bias = (rng.uniform(-1, 1, shape) / math.sqrt(inputs) for shape in ((inputs, units), units))
+            values = values @ weight + bias
+            values = np.maximum(values, 0) if units > 1 else values
+        outputs.append(values[:, 0])
+    found = tangent_kernel(Network.of("mlp64-48"), x, of_outputs=True)
+    np.testing.assert_allclose(found, np.cov(np.transpose(outputs)), rtol=0.1)
+
+
+def test_in_a_small_unit_from_zeros_it_is_the_sampled_learner_and_in_a_large_one_it_is_slower():
+    kernel, mdp = np.asarray(kernel_of(7), np.float64), random_mdp(7, 2)
+    tiny, huge = (
+        huber_regret(mdp.with_rewards(unit * mdp.rewards), seen_with(kernel, 0 * kernel), schedule=SHORT)
+        for unit in (2.0**-20, 2.0**20)
+    )
+    plain = sampled_regret(mdp, Representation.of_matrix(kernel), schedule=SHORT)
+    for of_tiny, of_plain in ((tiny.descent, plain.descent), (tiny.adam, plain.adam), (tiny.tabular, plain.tabular)):
+        np.testing.assert_allclose(of_tiny.greedy, of_plain.greedy, atol=1e-6)
+    assert huge.tabular.mean > tiny.tabular.mean + 0.02
+
+
+def test_regret_of_a_random_network_is_not_cut_and_a_report_has_it():
+    kernel, mdp = np.asarray(kernel_of(5), np.float64), chain(5)
+    found = huber_regret(mdp, seen_with(kernel, kernel), schedule=SHORT)
+    assert found.value == pytest.approx((found.descent.greedy.mean() + found.adam.greedy.mean()) / 2, abs=1e-12)
+    reported = hardness.report(mdp, ["huber_regret"], representation=seen_with(kernel, kernel), schedule=SHORT)
+    assert reported["huber_regret"].value == found.to_dict()
+    assert reported["huber_regret"].certificate.note.startswith("huber_regret: a mean over 3 walks")
+    assert found.to_dict()["conventions"]["clipped"] == {}
+
+
+def test_without_the_covariance_of_outputs_it_is_undefined():
+    with pytest.raises(UndefinedMeasure, match="huber_regret needs the covariance of the network's outputs"):
+        huber_regret(random_mdp(7, 1), Representation.of_matrix(np.eye(7)), schedule=SHORT)

@@ -17,6 +17,7 @@ from pharos.agents.agent import (
     learner_state,
 )
 from pharos.agents.idealised import (
+    HUBER_PREDICTORS,
     POLICY_CURVES,
     POLICY_PREDICTORS,
     SAMPLED_PREDICTORS,

@@ -5,7 +5,7 @@ Each says which network stands for the agent's, what it draws, and which columns
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +23,8 @@ POLICY_PREDICTORS = (
 with its clipping, of the most probable actions, as evaluated, and of a table."""
 SAMPLED_PREDICTORS = ("sampled_regret", "sampled_deviation", "sampled_descent", "sampled_adam", "sampled_tabular")
 """Columns of predictions of a DQN: the sampled learner, one walk's deviation, its two kernels, and a table's."""
+HUBER_PREDICTORS = ("huber_regret", "huber_deviation", "huber_descent", "huber_adam", "huber_tabular")
+"""The same of the sampled learner with the Huber loss that begins at a random network."""
 POLICY_CURVES = ("policy_curve", "clipped_curve")
 CURVE_POINTS = 40
 
@@ -103,22 +105,34 @@ class IdealisedDQN(Idealised):
         return int(config["hyperparameters"].get("learning_starts", 0)) + 1, "learning begins"
 
     def columns(self, config: Configuration, mdp: "TabularMDP", options: Mapping[str, Any]) -> dict[str, Any]:
-        return self.primary_columns(self.primary(config, mdp, options).value)
+        columns = SAMPLED_PREDICTORS, HUBER_PREDICTORS
+        results = (self._result(names[0], config, mdp, options) for names in columns)
+        return dict(
+            pair for names, result in zip(columns, results, strict=True) for pair in self._parts(names, result.value)
+        )
 
     def primary(self, config: Configuration, mdp: "TabularMDP", options: Mapping[str, Any]) -> "Result":
+        return self._result(self.predictor, config, mdp, options)
+
+    def _result(self, name: str, config: Configuration, mdp: "TabularMDP", options: Mapping[str, Any]) -> "Result":
         from pharos.hardness import Sampling, report
 
-        hyperparameters, noise = config["hyperparameters"], config["chance"].get("reward_noise", 0.0)
+        hyperparameters, chance = config["hyperparameters"], config["chance"]
         sizes = {name: int(hyperparameters[name]) for name in ("batch_size", "buffer_size") if name in hyperparameters}
-        sampling = Sampling(reward_noise=float(noise), **sizes)
-        name = "sampled_regret"
+        noise, scale = float(chance.get("reward_noise", 0.0)), float(chance.get("scale_rewards") or 1.0)
+        sampling = Sampling(reward_noise=noise, reward_scale=scale, **sizes)
         return report(mdp, [name], schedule=self.schedule(config), sampling=sampling, **options)[name]
 
     def primary_columns(self, value: Mapping[str, Any] | None) -> dict[str, Any]:
+        return dict(self._parts(SAMPLED_PREDICTORS if self.predictor == "sampled_regret" else HUBER_PREDICTORS, value))
+
+    @staticmethod
+    def _parts(names: Sequence[str], value: Mapping[str, Any] | None) -> Iterator[tuple[str, float]]:
+        """Pairs of columns and numbers."""
         if value is None:
-            return dict.fromkeys(SAMPLED_PREDICTORS, math.nan)
+            value = dict.fromkeys(("value", "deviation", "descent", "adam", "tabular"), math.nan)
         parts = (value["value"], value.get("deviation", math.nan), value["descent"], value["adam"], value["tabular"])
-        return dict(zip(SAMPLED_PREDICTORS, parts, strict=True))
+        return zip(names, parts, strict=True)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 # What the column "exact" says of each kind of certificate.
 PROVEN = {"exact": "yes", "interval": "interval", "float64": "float64"}
-IDEALISED = ("kernel_regret", "kernel_policy_regret", "sampled_regret")
+IDEALISED = ("kernel_regret", "kernel_policy_regret", "sampled_regret", "huber_regret")
 
 
 def hardness(

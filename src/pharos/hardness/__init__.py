@@ -34,7 +34,7 @@ from pharos.hardness.representation.kernel_regret import (
     kernel_sample_complexity,
 )
 from pharos.hardness.representation.learning import LearningCurve, Representation, Rollouts, Schedule
-from pharos.hardness.representation.sampled_regret import SampledRegret, Sampling, sampled_regret
+from pharos.hardness.representation.sampled_regret import SampledRegret, Sampling, huber_regret, sampled_regret
 from pharos.hardness.steps import ReturnDistribution, return_distribution
 from pharos.hardness.value_norm import ActionGapRegularity, action_gap_regularity, environmental_value_norm
 from pharos.hardness.visitation import (
@@ -85,6 +85,7 @@ __all__ = [
     "exploration_time",
     "gaps",
     "gorp_bound",
+    "huber_regret",
     "kernel_learning_time",
     "kernel_policy_regret",
     "kernel_regret",

@@ -21,7 +21,7 @@ from pharos.hardness.representation.kernel_regret import (
     kernel_sample_complexity,
 )
 from pharos.hardness.representation.learning import Representation, Rollouts, Schedule
-from pharos.hardness.representation.sampled_regret import Sampling, sampled_regret
+from pharos.hardness.representation.sampled_regret import Sampling, huber_regret, sampled_regret
 from pharos.hardness.value_norm import action_gap_regularity, certified_value_norm
 from pharos.hardness.visitation import covering, distribution_mismatch, exploration_time, mixing_time
 from pharos.mdp import TabularMDP
@@ -451,6 +451,15 @@ register(
     definition="mean over learning of (V* - V of the greedy policy) / (V* - V of uniform play) of Q-learning from "
     "drawn transitions in the tangent kernel of the agent's network and in its root; and that of a table",
     source="pharos; after Mnih et al. (2015)",
+    **_REPRESENTATION,
+)
+register(
+    "huber_regret",
+    lambda problem: _represented(huber_regret, problem, "solution", "sampling"),
+    definition="mean over learning of (V* - V of the greedy policy) / (V* - V of uniform play) of Q-learning from "
+    "drawn transitions in the tangent kernel of the agent's network and in its root, with the Huber loss and from a "
+    "random network; and that of a table",
+    source="pharos; after Huber (1964), Mnih et al. (2015), Lee et al. (2018)",
     **_REPRESENTATION,
 )
 register(

@@ -242,7 +242,7 @@ def _problem_conventions(problem: Problem) -> dict[str, Any]:
     if representation is not None and problem.rollouts is not None:
         represented["rollouts"] = problem.rollouts.to_dict()
     if representation is not None and problem.sampling is not None:
-        represented["sampling"] = asdict(problem.sampling)
+        represented["sampling"] = problem.sampling.to_dict()
     return {
         **represented,
         "gamma": float(mdp.gamma),

@@ -99,8 +99,10 @@ def _series(q, scale, a, b):
 
 
 @kernel
-def dense(q, theta, variances_x, variances_y, kinds, coefficients_x, coefficients_y, widths, weights, biases, out):
-    """out (I, J) float32 = the tangent kernel of the output of dense layers, the last of them linear.
+def dense(
+    q, theta, variances_x, variances_y, kinds, coefficients_x, coefficients_y, widths, weights, biases, of_outputs, out
+):
+    """out (I, J) = the tangent kernel of the output of dense layers, or the covariance of outputs if `of_outputs`.
 
     q, theta (I, J): of the first hidden layer. variances_x (L, I), variances_y (L, J): of all hidden layers.
     kinds (L,): RELU or TANH. coefficients_x (L, I, M), coefficients_y: of TANH. widths (L,): units. weights, biases
@@ -120,7 +122,7 @@ def dense(q, theta, variances_x, variances_y, kinds, coefficients_x, coefficient
                 inner = widths[layer] * value
                 tangent = inner + 1.0 + weights[layer] * widths[layer] * slope * tangent
                 covariance = weights[layer] * inner + biases[layer]
-            out[i, j] = tangent
+            out[i, j] = covariance if of_outputs else tangent
 
 
 @kernel

@@ -579,14 +579,16 @@ def learn(outcomes, group, episodes, values, walk, schedule, steps):
     (q (A, C), weights (A, m)), of which target stays as it is. walk: see `Walk`.
     schedule: (gamma, first epsilon, last epsilon, steps of exploration, first step of learning, gradient steps in so
     many steps: two numbers, largest step that does not overshoot; a minibatch takes that, or the largest that it bears
-    itself).
+    itself; temporal differences are cut at the last number: 1 for the Huber loss, infinity for the squared one).
     """
     offsets, next_states, outcome_rewards, cumulative_probabilities = outcomes
     terminal, starts, cumulative, chance, limit = episodes
     kernel, learned, _ = values
     memory, visits, cursor, word, noise, _ = walk
     num_actions = visits.shape[1]
-    gamma, first_epsilon, last_epsilon, exploration, begin, gradient_steps, period, largest_step = schedule
+    gamma, first_epsilon, last_epsilon, exploration, begin, gradient_steps, period, largest_step, largest_error = (
+        schedule
+    )
     for _ in range(steps):
         # start an episode
         if cursor[0] < 0:
@@ -621,7 +623,7 @@ def learn(outcomes, group, episodes, values, walk, schedule, steps):
         # learn: the gradient steps that fall due between this step and the next
         num_gradient_steps = (t + 1 - begin) * gradient_steps // period - (t - begin) * gradient_steps // period
         for _ in range(num_gradient_steps):
-            _learn_minibatch(values, walk, chance, gamma, largest_step, min(t + 1, len(memory[0])))
+            _learn_minibatch(values, walk, chance, (gamma, largest_step, largest_error), min(t + 1, len(memory[0])))
 
 
 @kernel(makes_arrays=False, forceinline=True)
@@ -656,8 +658,12 @@ def _remember(memory, noise, t, transition):
 
 
 @kernel(makes_arrays=False, forceinline=True)
-def _learn_minibatch(values, walk, chance, gamma, largest_step, num_stored):
-    """A gradient step on drawn transitions of the ring, the largest that they bear, at most `largest_step`."""
+def _learn_minibatch(values, walk, chance, limits, num_stored):
+    """A gradient step on drawn transitions of the ring, the largest that they bear.
+
+    limits: (gamma, the largest step, where temporal differences are cut).
+    """
+    gamma, largest_step, largest_error = limits
     kernel, learned, target = values
     memory, visits, _, word, _, (batch, errors) = walk
     observations, actions, next_observations, rewards = memory
@@ -674,7 +680,8 @@ def _learn_minibatch(values, walk, chance, gamma, largest_step, num_stored):
                     q = _q_value(kernel, target, d, a)
                     best = max(best, q) if a else q
             y += gamma * best
-        errors[i] = y - _q_value(kernel, learned, observations[j], actions[j])
+        error = y - _q_value(kernel, learned, observations[j], actions[j])
+        errors[i] = min(max(error, -largest_error), largest_error)
     # largest step of this minibatch that does not overshoot, by the row sums of its kernel (Gershgorin)
     bound = 0.0
     for i in range(size):

@@ -137,10 +137,11 @@ def representation(
     observer = observe(space.environment, observation, state_space=space, **options)
     first = network_inputs(observer, space.states(slice(0, 1)))
     if callable(network) or sources.is_reference(network):
-        tangent, named = kernel_of_module(network, first.shape[1:])
+        (tangent, named), outputs = kernel_of_module(network, first.shape[1:]), None
     else:
         net = Network.of(default_network(observer.space) if network is None else network, initialisation)
-        tangent, named = partial(tangent_kernel, net), {"network": net.name, "initialisation": net.initialisation}
+        tangent, outputs = partial(tangent_kernel, net), partial(tangent_kernel, net, of_outputs=True)
+        named = {"network": net.name, "initialisation": net.initialisation}
         if net.tanh and net.initialisation == "sb3":
             named["kernel"] = 2  # results that were kept of zeros without a slope are not taken
     tangent(first, None)  # what does not fit is said before all states are looked at
@@ -148,13 +149,13 @@ def representation(
     def inputs(states: np.ndarray) -> np.ndarray:
         return network_inputs(observer, space.states(states))
 
-    def kernel(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    def pairs(function: Callable[..., np.ndarray], rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
         check_memory(len(rows), len(columns), str(space.environment))
         same = rows is columns
-        return tangent(inputs(rows), None if same else inputs(columns))
+        return function(inputs(rows), None if same else inputs(columns))
 
     return Representation(
-        kernel=kernel,
+        kernel=partial(pairs, tangent),
         classes=observation_classes(space, observer),
         time_limit=int(space.environment.max_episode_steps),
         landmarks=landmarks,
@@ -167,6 +168,7 @@ def representation(
             "landmarks": landmarks,
             "digest": _inputs_digest(inputs, space.num_states),
         },
+        covariance=None if outputs is None else partial(pairs, outputs),
     )
 
 

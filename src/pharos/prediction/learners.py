@@ -49,7 +49,7 @@ def predicted(config: Mapping[str, Any], *, primary: bool = False) -> dict[str, 
     try:
         task = RunConfig.from_dict(config).task(trust=True, strict=True)
         name, initialisation = network_of(config, task)
-        options = _options(task, name, initialisation)
+        options, config = _options(task, name, initialisation), {**config, "chance": task.scaled_chance.to_dict()}
         row |= {"num_states": float(task.mdp.num_states), "network": f"{name}, {initialisation}"}
         if primary:
             return row | _of_primary(config, task.mdp, options)
@@ -163,7 +163,10 @@ def primary_regret(
     name: Network = own_network
     if network is not None:
         name = network + idealised.suffix if isinstance(network, str) and _is_named(network) else network
-    options = _options(task, name, initialisation, landmarks)
+    options, config = (
+        _options(task, name, initialisation, landmarks),
+        {**config, "chance": task.scaled_chance.to_dict()},
+    )
     result = idealised.primary(config, task.mdp, options)
     value = result.value
     if value is None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pharos.agents import POLICY_PREDICTORS, SAMPLED_PREDICTORS
+from pharos.agents import HUBER_PREDICTORS, POLICY_PREDICTORS, SAMPLED_PREDICTORS
 from pharos.errors import ParameterError
 from pharos.prediction import PREDICTORS, Pairs
 from pharos.statistics import holm, percentiles, permutation_p_value, r_squared, spearman
@@ -32,7 +32,7 @@ OUTCOMES = {
 ABSOLUTE = "cumulative"  # in units of reward: judged only beside what random play would lose
 LINEAR = tuple(
     name
-    for name in (*PREDICTORS, *SAMPLED_PREDICTORS, *POLICY_PREDICTORS)
+    for name in (*PREDICTORS, *SAMPLED_PREDICTORS, *HUBER_PREDICTORS, *POLICY_PREDICTORS)
     if "regret" in name or name == "aliasing_floor"
 )
 """Predictors that enter as they are; the others as logarithms."""
@@ -192,8 +192,8 @@ def unseen_classes(
 
 def _predictors_of(predictions: "pd.DataFrame") -> list[str]:
     """Names of pharos' predictors, and of other columns of numbers, such as a user's measures."""
-    ours = (*PREDICTORS, SAMPLED_PREDICTORS[0], *POLICY_PREDICTORS)
-    others = {*CELL, *SAMPLED_PREDICTORS, "estimated_error"}
+    ours = (*PREDICTORS, SAMPLED_PREDICTORS[0], HUBER_PREDICTORS[0], *POLICY_PREDICTORS)
+    others = {*CELL, *SAMPLED_PREDICTORS, *HUBER_PREDICTORS, "estimated_error"}
     added = [name for name in predictions if name not in (*ours, *others) and predictions[name].dtype.kind in "fiu"]
     return [*ours, *added]
 

@@ -37,6 +37,7 @@ class Representation:
         landmarks: of the approximation beyond MOST_WITHOUT_LANDMARKS different observations. 0 means none, whatever it
             takes. 2 or more are used for all sizes.
         conventions: what it is, JSON-able.
+        covariance: as `kernel`, the covariance of an output of the network before training; None: not known.
     """
 
     kernel: Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -44,6 +45,7 @@ class Representation:
     time_limit: int | None = None
     landmarks: int | None = None
     conventions: Mapping[str, Any] = field(default_factory=dict)
+    covariance: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
 
     def __post_init__(self) -> None:
         if self.landmarks == 1:

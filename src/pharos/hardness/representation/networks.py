@@ -160,9 +160,14 @@ def check_memory(rows: int, columns: int, what: str) -> None:
         )
 
 
-def tangent_kernel(network: Network, x: np.ndarray, y: np.ndarray | None = None) -> np.ndarray:
+def tangent_kernel(
+    network: Network, x: np.ndarray, y: np.ndarray | None = None, *, of_outputs: bool = False
+) -> np.ndarray:
     """The tangent kernel (N, M) float32 of a network on inputs x (N, ...), y (M, ...) as `network_inputs` gives them.
 
+    Args:
+        of_outputs: return the covariance of an output of the random network in its place, the q of the output above:
+            the outputs of wide networks before training are a Gaussian process (Neal, 1996; Lee et al., 2018).
     Raises:
         ParameterError: the network has convolutions and the inputs are no images, or these are too small.
     """
@@ -180,7 +185,7 @@ def tangent_kernel(network: Network, x: np.ndarray, y: np.ndarray | None = None)
     def run(begin: int, end: int) -> None:
         for i, j in blocks[begin:end]:
             block = slice(i, i + side), slice(j, j + side)
-            head(*first(*block), *block, out[block])
+            head(*first(*block), *block, of_outputs, out[block])
 
     in_blocks(run, len(blocks), 1)
     if y is None:
@@ -357,13 +362,15 @@ class _Head:
             variances.append(self.weights[layer] * self.widths[layer] * square + self.biases[layer])
         return np.stack(variances[:-1]), np.stack(coefficients)
 
-    def __call__(self, q: np.ndarray, theta: np.ndarray, rows: slice, columns: slice, out: np.ndarray) -> None:
+    def __call__(
+        self, q: np.ndarray, theta: np.ndarray, rows: slice, columns: slice, of_outputs: bool, out: np.ndarray
+    ) -> None:
         from pharos.kernels.observation_kernels import dense
 
         (of_x, series_x), (of_y, series_y) = self.x, self.y
         sides = of_x[:, rows], of_y[:, columns]
         series = series_x[:, rows], series_y[:, columns]
-        dense(q, theta, *sides, self.kinds, *series, self.widths, self.weights, self.biases, out)
+        dense(q, theta, *sides, self.kinds, *series, self.widths, self.weights, self.biases, of_outputs, out)
 
 
 def _tanh_coefficients(variances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

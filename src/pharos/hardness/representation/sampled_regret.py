@@ -13,18 +13,22 @@ from typing import Any
 
 import numpy as np
 
-from pharos.errors import ParameterError
+from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.representation.learning import (
+    DEFAULT_LANDMARKS,
+    MOST_WITHOUT_LANDMARKS,
     STEP_MARGIN,
     WORST_GREEDY,
     Grouped,
     IdealisedLearner,
     Identity,
     KernelOperator,
+    Landmarks,
     Representation,
     Schedule,
     greedy_policy,
 )
+from pharos.hardness.visitation import drawn_indices
 from pharos.mdp import TabularMDP, paid_outcomes, require_mdp, whole_number
 from pharos.solvers import Solution
 
@@ -41,6 +45,7 @@ class Sampling:
         batch_size: transitions of a gradient step.
         buffer_size: transitions that are remembered.
         reward_noise: standard deviation of normal noise on what is paid. The regret is of what is earned.
+        reward_scale: what is earned is divided by it before it is paid. Only `huber_regret` depends on it.
         seed: of the first walk. The others have the next ones.
     """
 
@@ -48,6 +53,7 @@ class Sampling:
     batch_size: int = 32
     buffer_size: int = 1_000_000
     reward_noise: float = 0.0
+    reward_scale: float = 1.0
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -55,7 +61,13 @@ class Sampling:
             whole_number(getattr(self, name), f"sampling: {name}")
         if not (math.isfinite(self.reward_noise) and self.reward_noise >= 0):
             raise ParameterError(f"sampling: reward_noise is {self.reward_noise!r}; expected at least 0")
+        if not 0 < self.reward_scale < math.inf:
+            raise ParameterError(f"sampling: reward_scale is {self.reward_scale!r}; expected a number above 0")
         whole_number(self.seed, "sampling: seed", "a whole number, at least 0", least=0)
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able. Without `reward_scale` if it is 1, as it was before there was one."""
+        return {name: value for name, value in asdict(self).items() if name != "reward_scale" or value != 1.0}
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,15 +77,17 @@ class SampledCurve:
     Attributes:
         steps: (J,) at which walks were evaluated.
         greedy: (walks, J).
+        worst: a policy's regret counts no more than this.
     """
 
     steps: np.ndarray
     greedy: np.ndarray
+    worst: float = WORST_GREEDY
 
     @property
     def walks(self) -> np.ndarray:
-        """(walks,) the mean over evaluations of each. A policy counts at most WORST_GREEDY."""
-        return np.minimum(self.greedy, WORST_GREEDY).mean(axis=1)
+        """(walks,) the mean over evaluations of each. A policy counts at most `worst`."""
+        return np.minimum(self.greedy, self.worst).mean(axis=1)
 
     @property
     def mean(self) -> float:
@@ -101,6 +115,7 @@ class SampledRegret:
         landmarks: of the approximation. None: the kernel is exact.
         estimated_error: half of the landmarks change the value by that much: an estimate, not a bound. 0 if exact.
         conventions: schedule, sampling, episode, observation and network.
+        name: of the measure.
     """
 
     descent: SampledCurve
@@ -111,6 +126,7 @@ class SampledRegret:
     landmarks: int | None = None
     estimated_error: float = 0.0
     conventions: Mapping[str, Any] = field(default_factory=dict)
+    name: str = "sampled_regret"
 
     @property
     def value(self) -> float:
@@ -127,9 +143,9 @@ class SampledRegret:
     def note(self) -> str:
         """Deviation between walks, and the landmarks with their estimated error, as text."""
         count = len(self.descent.greedy)
-        text = f"sampled_regret: a mean over {count} walks, one of which deviates by {self.deviation:.2g}"
+        text = f"{self.name}: a mean over {count} walks, one of which deviates by {self.deviation:.2g}"
         if count == 1:
-            text = "sampled_regret: of a single walk"
+            text = f"{self.name}: of a single walk"
         if self.landmarks is None:
             return text
         return (
@@ -205,31 +221,21 @@ def sampled_regret(
     Source: pharos, with what is drawn as in Mnih et al. (2015).
     """
     learner = SampledLearner(mdp, representation, schedule, horizon, solution, progress)
-    learner.sampling = sampling = sampling or Sampling()
-    operators, landmarks = learner.operators()
-    (descent, adam), *half = map(learner.both, operators)
-    error = sum((abs(descent.mean + adam.mean - one.mean - other.mean) / 2 for one, other in half), 0.0)
-    of_schedule = {name: value for name, value in asdict(learner.schedule).items() if name != "optimizer"}
-    settings = {"schedule": of_schedule, "sampling": asdict(sampling)}
-    conventions = learner.conventions(settings, {"greedy": WORST_GREEDY})
-    conventions["step_size"] += ", at most what a minibatch bears"
-    return SampledRegret(
-        descent=descent,
-        adam=adam,
-        tabular=learner.curve_of_walks(learner.table, Identity()),
-        observations=len(learner.observations),
-        states=len(learner.states),
-        landmarks=landmarks,
-        estimated_error=error,
-        conventions=conventions,
-    )
+    return learner.measured(sampling or Sampling())
 
 
 class SampledLearner(IdealisedLearner):
-    """Q-learning in a kernel, from drawn transitions of an MDP."""
+    """Q-learning in a kernel, from drawn transitions of an MDP.
+
+    Attributes:
+        largest_error: where temporal differences are cut.
+        worst: a policy's regret counts no more than this.
+    """
 
     measure = "sampled_regret"
     sampling: Sampling
+    largest_error = math.inf
+    worst = WORST_GREEDY
 
     @cached_property
     def outcomes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -242,7 +248,29 @@ class SampledLearner(IdealisedLearner):
         begin = np.append(0.0, cumulative)[offsets[:-1]]
         levels = (cumulative - begin[which]) / np.add.reduceat(probabilities, offsets[:-1])[which]
         ends = np.where(states == self.whole.num_states, -1, states)
-        return offsets, ends, np.asarray(rewards, np.float64), levels
+        return offsets, ends, np.asarray(rewards, np.float64) / self.sampling.reward_scale, levels
+
+    def measured(self, sampling: Sampling) -> SampledRegret:
+        """The measure: both kernels and a table."""
+        self.sampling = sampling
+        operators, landmarks = self.operators()
+        (descent, adam), *half = map(self.both, operators)
+        error = sum((abs(descent.mean + adam.mean - one.mean - other.mean) / 2 for one, other in half), 0.0)
+        of_schedule = {name: value for name, value in asdict(self.schedule).items() if name != "optimizer"}
+        settings = {"schedule": of_schedule, "sampling": sampling.to_dict()}
+        conventions = self.conventions(settings, {"greedy": self.worst} if math.isfinite(self.worst) else {})
+        conventions["step_size"] += ", at most what a minibatch bears"
+        return SampledRegret(
+            descent=descent,
+            adam=adam,
+            tabular=self.curve_of_walks(self.table, Identity()),
+            observations=len(self.observations),
+            states=len(self.states),
+            landmarks=landmarks,
+            estimated_error=error,
+            conventions=conventions,
+            name=self.measure,
+        )
 
     def both(self, operator: KernelOperator) -> tuple[SampledCurve, SampledCurve]:
         """(regret with a kernel, regret with its root)."""
@@ -256,7 +284,12 @@ class SampledLearner(IdealisedLearner):
         steps = np.unique(np.round(np.linspace(0, self.schedule.steps, LOOKS + 1)).astype(np.int64))
         seeds = range(self.sampling.seed, self.sampling.seed + self.sampling.walks)
         walks = (self.walk(observations, operator, steps, seed) for seed in seeds)
-        return SampledCurve(steps, np.array([[self._regret_of(q, observations) for q in walk] for walk in walks]))
+        regrets = np.array([[self._regret_of(q, observations) for q in walk] for walk in walks])
+        return SampledCurve(steps, regrets, self.worst)
+
+    def start(self, observations: Grouped, seed: int) -> np.ndarray:
+        """Q (A, C) of a walk before its first step."""
+        return np.zeros((self.whole.num_actions, len(observations)))
 
     def _regret_of(self, q: np.ndarray, observations: Grouped) -> float:
         """Regret of the policy that is greedy in values (C, A)."""
@@ -273,7 +306,7 @@ class SampledLearner(IdealisedLearner):
         group = np.full(mdp.num_states, -1, np.int64)
         group[self.numbers] = observations.groups
         kernel = operator.parts(count)
-        learnt = np.zeros((num_actions, count)), np.zeros((num_actions, kernel[1].shape[1]))
+        learnt = self.start(observations, seed), np.zeros((num_actions, kernel[1].shape[1]))
         target = tuple(each.copy() for each in learnt)
         size = min(sampling.buffer_size, schedule.steps)
         memory = *(np.zeros(size, np.int64) for _ in range(3)), np.zeros(size)
@@ -306,5 +339,75 @@ class SampledLearner(IdealisedLearner):
                 weights = visits.max(axis=1, keepdims=True) / max(step, 1)
                 largest = operator.largest_eigenvalue(weights, vector) if step else 0.0
                 largest_step = 1 / (STEP_MARGIN * largest) if largest > 0 else math.inf
-            learning = (kernel, learnt, target), state, (*numbers, largest_step)
+            learning = (kernel, learnt, target), state, (*numbers, largest_step, self.largest_error)
             kernels.learn(self.outcomes, group, episodes, *learning, int(next_stop - step))
+
+
+# With the agent's loss, from a random network -------------------------------------------------------------------------
+
+
+@require_mdp
+def huber_regret(
+    mdp: TabularMDP,
+    representation: Representation,
+    *,
+    schedule: Schedule | None = None,
+    sampling: Sampling | None = None,
+    solution: Solution | None = None,
+    horizon: int | None = None,
+    progress: Callable[[str], object] | None = None,
+) -> SampledRegret:
+    """Return the regret of Q-learning in a network's tangent kernel with the Huber loss, from a random network.
+
+    This is `sampled_regret` with two parts of a DQN that it leaves out:
+
+        Q(., a) += eta / |B| sum_i [a_i = a] min(max(y_i - Q(s_i, a_i), -1), 1) K(., s_i)
+        Q(., a) before the first step is a draw from the Gaussian process of the network's outputs, for each action anew
+
+    So the unit of rewards matters: the larger they are, the more steps it takes to learn their values. The regret of a
+    policy is not cut, as that of runs is not. A table begins at zeros.
+
+    Args:
+        representation: as for `sampled_regret`, with the covariance of the network's outputs.
+        schedule, sampling, solution, horizon, progress: as for `sampled_regret`.
+    Returns:
+        A SampledRegret.
+    Raises:
+        UndefinedMeasure: the representation does not have that covariance, or as for `sampled_regret`.
+        ParameterError: as for `sampled_regret`.
+    Cost: as for `sampled_regret`, and C^3 once more for the draw.
+    Source: pharos, with the loss as in Huber (1964) and Mnih et al. (2015), and the process as in Lee et al. (2018).
+    """
+    learner = HuberLearner(mdp, representation, schedule, horizon, solution, progress)
+    return learner.measured(sampling or Sampling())
+
+
+class HuberLearner(SampledLearner):
+    """The sampled learner with the Huber loss, from a random network."""
+
+    measure = "huber_regret"
+    largest_error = 1.0
+    worst = math.inf
+
+    @cached_property
+    def outputs(self) -> Landmarks:
+        """The covariance of the random network's outputs over observations, as features and a diagonal."""
+        observed, covariance = self.observations.representatives, self.representation.covariance
+        if covariance is None:
+            raise UndefinedMeasure(
+                f"{self.measure} needs the covariance of the network's outputs, which this representation does not "
+                "have: take a network with a closed form, such as mlp128x2"
+            )
+        if len(observed) <= MOST_WITHOUT_LANDMARKS:
+            return Landmarks(covariance, observed, observed)
+        return Landmarks(covariance, observed, observed[drawn_indices(self.weights, DEFAULT_LANDMARKS)])
+
+    def start(self, observations: Grouped, seed: int) -> np.ndarray:
+        """A draw of the process. A table begins at zeros."""
+        if observations is self.table:
+            return super().start(observations, seed)
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(3,)))
+        features, diagonal, actions = self.outputs.features, self.outputs.diagonal, self.whole.num_actions
+        of_features = rng.standard_normal((features.shape[1], actions))
+        of_each = rng.standard_normal((len(features), actions))
+        return np.ascontiguousarray((features @ of_features + np.sqrt(diagonal) * of_each).T)
