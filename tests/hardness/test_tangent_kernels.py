@@ -9,7 +9,7 @@ from gymnasium import spaces
 
 import pharos
 from pharos.errors import ParameterError, UnknownName
-from pharos.hardness import Network, default_network, empirical_ntk, tangent_kernel
+from pharos.hardness import Network, default_network, empirical_ntk, kernel_of_module, tangent_kernel
 from pharos.observations import network_inputs, ntk, observe
 from refusals import refusal
 
@@ -68,6 +68,28 @@ def test_the_closed_form_is_the_mean_over_random_networks(name, space, x, net_ar
     error = np.abs(found / expected - 1)
     # 16 orthogonal filters differ so much from one network to the next that single entries take thousands of networks
     assert (error.mean() if name == "cnn16+tanh" else error.max()) <= 0.02
+
+
+@pytest.mark.parametrize(("name", "space", "x"), [("mlp128x2", BOX, VECTORS), ("cnn16", IMAGE, IMAGES)])
+def test_the_covariance_of_outputs_is_the_mean_over_random_networks(name, space, x):
+    """In closed form, and of the 20 networks of a function as PyTorch draws them."""
+    import torch
+
+    def make(_shape):
+        return agents_network(space, [128], "pytorch")
+
+    with torch.random.fork_rng(devices=[]), torch.no_grad():
+        torch.manual_seed(0)
+        outputs = np.array([make(x.shape[1:])(torch.as_tensor(x))[:, 0].numpy() for _ in range(1000)])
+    products = outputs[:, :, None] * outputs[:, None]
+    closed = tangent_kernel(Network.of(name), x, of_outputs=True)
+    deviation = products.std(axis=0) / np.sqrt(len(products))
+    assert (np.abs(closed - products.mean(axis=0)) <= 4 * deviation + 0.02 * closed).all()
+    kernel, _ = kernel_of_module(make, x.shape[1:])
+    np.testing.assert_allclose(kernel(x, of_outputs=True), products[:20].mean(axis=0), rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(
+        kernel(x, x[:2], of_outputs=True), products[:20].mean(axis=0)[:, :2], rtol=1e-4, atol=1e-7
+    )
 
 
 def test_one_pair_is_what_the_recursion_says():

@@ -137,11 +137,10 @@ def representation(
     observer = observe(space.environment, observation, state_space=space, **options)
     first = network_inputs(observer, space.states(slice(0, 1)))
     if callable(network) or sources.is_reference(network):
-        (tangent, named), outputs = kernel_of_module(network, first.shape[1:]), None
+        tangent, named = kernel_of_module(network, first.shape[1:])
     else:
         net = Network.of(default_network(observer.space) if network is None else network, initialisation)
-        tangent, outputs = partial(tangent_kernel, net), partial(tangent_kernel, net, of_outputs=True)
-        named = {"network": net.name, "initialisation": net.initialisation}
+        tangent, named = partial(tangent_kernel, net), {"network": net.name, "initialisation": net.initialisation}
         if net.tanh and net.initialisation == "sb3":
             named["kernel"] = 2  # results that were kept of zeros without a slope are not taken
     tangent(first, None)  # what does not fit is said before all states are looked at
@@ -168,7 +167,7 @@ def representation(
             "landmarks": landmarks,
             "digest": _inputs_digest(inputs, space.num_states),
         },
-        covariance=None if outputs is None else partial(pairs, outputs),
+        covariance=partial(pairs, partial(tangent, of_outputs=True)),
     )
 
 

@@ -17,7 +17,7 @@ NETWORKS = 20  # random ones, if there is no closed form
 
 def kernel_of_module(network: object, shape: tuple[int, ...]) -> tuple[Callable[..., np.ndarray], dict[str, Any]]:
     """Return (kernel of inputs x and y, its description) of a function of a shape that makes networks, or of its
-    name."""
+    name. With `of_outputs` the kernel is the covariance of an output of the random networks."""
     source = sources.find_source(network) if isinstance(network, str) else sources.source_of(network)
     function = sources.load_source(source) if isinstance(network, str) and source is not None else network
     name = source.name if source is not None else str(getattr(network, "__name__", network))
@@ -26,9 +26,10 @@ def kernel_of_module(network: object, shape: tuple[int, ...]) -> tuple[Callable[
     if not callable(function):
         raise ParameterError(f"network {name!r}: found {function!r}; expected a function of the shape of an input")
 
-    def kernel(x: np.ndarray, y: np.ndarray | None = None) -> np.ndarray:
+    def kernel(x: np.ndarray, y: np.ndarray | None = None, *, of_outputs: bool = False) -> np.ndarray:
+        features = _outputs if of_outputs else _gradients
         try:
-            return empirical_ntk(partial(function, shape), x, others=y, networks=NETWORKS)
+            return _mean_products(features, partial(function, shape), x, y, NETWORKS)
         except MissingExtra:
             raise
         except Exception as error:
@@ -59,6 +60,18 @@ def empirical_ntk(
     Cost: `networks` times N + M gradients, which lie in memory one network at a time.
     Source: Jacot, Gabriel and Hongler (2018).
     """
+    return _mean_products(_gradients, make, x, others, networks, seed)
+
+
+def _mean_products(
+    features: Callable[["torch.nn.Module", "torch.Tensor"], "torch.Tensor"],
+    make: Callable[[], Any],
+    x: np.ndarray,
+    others: np.ndarray | None,
+    networks: int,
+    seed: int = 0,
+) -> np.ndarray:
+    """The mean over random networks of the inner products of features of their inputs. See `empirical_ntk`."""
     try:
         import torch
     except ImportError as error:
@@ -74,11 +87,12 @@ def empirical_ntk(
             network = make()
             if not isinstance(network, torch.nn.Module):
                 raise ParameterError(f"make returned {network!r}; expected a torch.nn.Module")
-            rows = _gradients(network, inputs)
-            facing = rows if columns is None else _gradients(network, columns)
+            rows = features(network, inputs)
+            facing = rows if columns is None else features(network, columns)
             total += (rows @ facing.T).double().numpy()
     if not np.isfinite(total).all():
-        raise ParameterError("gradients of the network are not finite; expected finite parameters and inputs")
+        what = "outputs" if features is _outputs else "gradients"
+        raise ParameterError(f"{what} of the network are not finite; expected finite parameters and inputs")
     if others is None:
         total = (total + total.T) / 2  # products of one matrix with its own transpose may differ in the last bits
     return (total / networks).astype(np.float32)
@@ -98,3 +112,12 @@ def _gradients(network: "torch.nn.Module", inputs: "torch.Tensor") -> "torch.Ten
 
     gradients = torch.func.vmap(torch.func.grad(output), in_dims=(None, 0))(parameters, inputs)
     return torch.cat([each.flatten(1) for each in gradients.values()], dim=1)
+
+
+def _outputs(network: "torch.nn.Module", inputs: "torch.Tensor") -> "torch.Tensor":
+    """(N, A): the outputs, so scaled that products are means over outputs."""
+    import torch
+
+    with torch.no_grad():
+        outputs = network(inputs)
+    return outputs / outputs.shape[1] ** 0.5
