@@ -4,6 +4,8 @@
     python benchmarks/prediction_cells.py judge [--cells cells.csv] [--resamples 1000]
     python benchmarks/prediction_cells.py orders [--cells cells.csv]
     python benchmarks/prediction_cells.py sealed [--cells cells.csv] [--resamples 1000]
+    python benchmarks/prediction_cells.py collect
+    python benchmarks/prediction_cells.py third [--resamples 1000]
     python benchmarks/prediction_cells.py pilots [--cells cells.csv] [--write]
     python benchmarks/prediction_cells.py draw [--cells cells.csv] [--picture docs/images/sealed.png]
     python benchmarks/prediction_cells.py cost
@@ -16,6 +18,7 @@ after a line, Spearman's rank correlation, the share of pairs of observations th
 fit, half the width of the 80 % interval and the share of classes left out that it covers; in brackets 95 % intervals
 over classes drawn anew. Classes weigh alike. `orders` prints the pairs of observations by predicted difference.
 `sealed` prints the same of the second sealed test, by block and predictor, and what the interval of before it held.
+`collect` puts predictions and packed runs of the third one into its table of cells, and `third` prints its result.
 `pilots` prints how well a seed that is cut after a share of its steps predicts others, with the measure and without.
 `draw` draws predicted against observed regret of the second sealed set. `cost` prints the seconds of a cell and the
 memory that it adds, each in a process of its own that has compiled, by states of a grid, agent and observation.
@@ -60,22 +63,41 @@ BLOCKS = {
         DEV / "long-random-ppo.yaml", DEV / "long-random-ppo-runs.parquet", DEV / "long-random-ppo-predictions.parquet",
     ),
 }  # fmt: skip
+SEEDS = 4
 COLUMNS = ("study", *CELL, "steps", "states", "spread", "predicted", "observed", "seeds")
+
+
+def cells_of(specification, runs):
+    """Cells of packed runs: mean greedy regret, seeds, V* - U of the runs that are finished."""
+    with tempfile.TemporaryDirectory() as folder:
+        study.unpack(runs, Path(folder) / "runs", into=specification)
+        table = study.table(specification, Path(folder) / "runs")
+        cells = study.outcomes(table, study.curves(specification, Path(folder) / "runs"))
+    table["spread"] = table["value_optimal"] - table["value_uniform"]
+    return cells.merge(table.groupby(CELL).agg(seeds=("id", "size"), spread=("spread", "mean")), on=CELL)
+
+
+def collect(name):
+    """Write the cells of a sealed set: its predictions, beside the regret of its packed runs of four seeds."""
+    source, frames = STUDIES / name, []
+    for file in sorted(source.glob("predictions-*.parquet")):
+        frame, record = study.read_predictions(file)
+        frame = frame.assign(part=file.stem.removeprefix("predictions-"), predicted_at=record["date"])
+        frames.append(frame.drop(columns=[each for each in frame if "curve" in each]))
+    observed = pd.concat([cells_of(source / "study.yaml", runs) for runs in sorted(source.glob("runs-*.parquet"))])
+    cells = pd.concat(frames).merge(observed[[*CELL, "greedy", "greedy_noise", "seeds", "spread"]], on=CELL)
+    cells[cells["seeds"] == SEEDS].to_csv(source / "cells.csv", index=False, lineterminator="\n")
+    print(f"{(cells['seeds'] == SEEDS).sum()} of {len(cells)} cells have {SEEDS} seeds")
 
 
 def observed_of(block, specification, runs):
     """CELL -> (mean greedy regret, seeds, V* - U) of the runs that are finished."""
     if runs is None:  # of a sealed set, whose table of cells is kept
         cells = pd.read_csv(STUDIES / block / "cells.csv")
-        if block == "sealed-2":  # plain, with the common hyperparameters: its primary test
+        if block != "sealed-1":  # plain, with the common hyperparameters: its primary test
             cells = cells[cells["part"].str[0].isin(["a", "b", "c"])]
     else:
-        with tempfile.TemporaryDirectory() as folder:
-            study.unpack(runs, Path(folder) / "runs", into=specification)
-            table = study.table(specification, Path(folder) / "runs")
-            cells = study.outcomes(table, study.curves(specification, Path(folder) / "runs"))
-            table["spread"] = table["value_optimal"] - table["value_uniform"]
-            cells = cells.merge(table.groupby(CELL).agg(seeds=("id", "size"), spread=("spread", "mean")), on=CELL)
+        cells = cells_of(specification, runs)
     return {
         tuple(row[name] for name in CELL): row for row in cells.to_dict("records") if row["greedy"] == row["greedy"]
     }
@@ -167,13 +189,46 @@ def sealed(file, resamples):
         for blocks, names in (("abc", predictors), ("d", predictors[:1]), ("e", predictors[:1])):
             part = mine[mine["part"].str[0].isin([*blocks])]
             for name in names:
-                cells = part.rename(columns={name: "predicted", "greedy": "observed", "num_states": "states"})
-                cells = cells.assign(study="sealed-2", steps=30_000)
-                inside = (cells["predicted"] - cells["observed"]).abs() <= width
-                held = inside.groupby(cells["environment"]).mean().mean()
-                title = f"{', '.join(blocks)} | {agent.upper()} | `{name}` | {len(cells)}"
-                r_squared, rho, pairs, unfitted, *_ = said_of(cells, resamples).split(" | ")
-                print(f"| {title} | {r_squared} | {rho} | {pairs} | {unfitted} | {held:.2f} of ± {width:.2f} |")
+                print(row_of(part, blocks, name, width, resamples))
+
+
+# The third sealed test: predictors, and half of the intervals that were named before it.
+NAMED = {
+    "dqn": {"huber_regret": 0.17, "sampled_regret": 0.18, "huber_descent": 0.17, "huber_adam": 0.17},
+    "ppo": {"clipped_regret_evaluated": 0.19},
+}
+
+
+def third(resamples):
+    """The third sealed test: blocks a to c by predictor, each of them, the two groups of units, and block d."""
+    frame = pd.read_csv(STUDIES / "sealed-3" / "cells.csv")
+    for agent, widths in NAMED.items():
+        mine = frame[frame["agent"] == agent]
+        tested = mine[mine["part"].str[0].isin([*"abc"])]
+        for name, width in widths.items():
+            print(row_of(tested, "abc", name, width, resamples))
+        groups = {"V\\* - U above 20": tested["spread"] > 20, "V\\* - U below 0.5": tested["spread"] < 0.5}
+        for name, width in [*widths.items()][:2]:
+            for blocks in "abcd":
+                part = mine[mine["part"].str[0] == blocks]
+                if len(part):
+                    print(row_of(part, blocks, name, width, resamples))
+            for words, chosen in groups.items():
+                error = (tested["greedy"] - tested[name])[chosen]
+                of_class = tested["environment"][chosen]
+                means = [each.groupby(of_class).mean().mean() for each in (error, error.abs())]
+                print(f"| {words} | {agent.upper()} | `{name}` | {len(error)} | {means[0]:+.2f} | {means[1]:.2f} |")
+
+
+def row_of(part, blocks, name, width, resamples):
+    """A row of the table of a sealed test: of cells and a predictor, with the share that lies within `width`."""
+    cells = part.rename(columns={name: "predicted", "greedy": "observed", "num_states": "states"})
+    cells = cells.assign(study="sealed", steps=30_000)
+    inside = (cells["predicted"] - cells["observed"]).abs() <= width
+    held = inside.groupby(cells["environment"]).mean().mean()
+    title = f"{', '.join(blocks)} | {part['agent'].iloc[0].split()[0].upper()} | `{name}` | {len(cells)}"
+    r_squared, rho, pairs, unfitted, *_ = said_of(cells, resamples).split(" | ")
+    return f"| {title} | {r_squared} | {rho} | {pairs} | {unfitted} | {held:.2f} of ± {width:.2f} |"
 
 
 def said_of(cells, resamples):
@@ -323,7 +378,9 @@ def statistics(known, counts):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("task", choices=("compute", "judge", "orders", "sealed", "pilots", "draw", "cost"))
+    parser.add_argument(
+        "task", choices=("compute", "judge", "orders", "sealed", "collect", "third", "pilots", "draw", "cost")
+    )
     parser.add_argument("--out", type=Path, default=CELLS_FILE)
     parser.add_argument("--cells", type=Path, default=CELLS_FILE)
     parser.add_argument("--block", action="append", choices=[*BLOCKS])
@@ -339,6 +396,10 @@ def main():
         orders(arguments.cells)
     elif arguments.task == "sealed":
         sealed(arguments.cells, arguments.resamples)
+    elif arguments.task == "collect":
+        collect("sealed-3")
+    elif arguments.task == "third":
+        third(arguments.resamples)
     elif arguments.task == "pilots":
         pilots(arguments.cells, arguments.write)
     elif arguments.task == "cost":
