@@ -3,25 +3,26 @@
     python benchmarks/prediction_cells.py compute --out cells.csv [--block NAME ...]
     python benchmarks/prediction_cells.py judge [--cells cells.csv] [--resamples 1000]
     python benchmarks/prediction_cells.py orders [--cells cells.csv]
-    python benchmarks/prediction_cells.py sealed [--cells cells.csv] [--resamples 1000]
+    python benchmarks/prediction_cells.py sealed [--resamples 1000]
     python benchmarks/prediction_cells.py collect
-    python benchmarks/prediction_cells.py third [--resamples 1000]
+    python benchmarks/prediction_cells.py third [--cells cells.csv] [--resamples 1000]
     python benchmarks/prediction_cells.py pilots [--cells cells.csv] [--write]
     python benchmarks/prediction_cells.py draw [--cells cells.csv] [--picture docs/images/sealed.png]
     python benchmarks/prediction_cells.py cost
 
 `compute` reads the packed runs of docs/studies (twelve development classes: hardness-dev; fourteen sealed ones:
-sealed-1; fourteen others: sealed-2, blocks a to c) and computes the primary predictor of each cell, `sampled_regret` of
-a DQN; those of a PPO and of sealed-2 are in the files of predictions. A row that is there already is not computed
-again. `judge` prints how well predictions agree with runs, by set and agent: number of cells, R2 of classes left out
-after a line, Spearman's rank correlation, the share of pairs of observations that are ordered rightly, R2 without a
-fit, half the width of the 80 % interval and the share of classes left out that it covers; in brackets 95 % intervals
-over classes drawn anew. Classes weigh alike. `orders` prints the pairs of observations by predicted difference.
-`sealed` prints the same of the second sealed test, by block and predictor, and what the interval of before it held.
-`collect` puts predictions and packed runs of the third one into its table of cells, and `third` prints its result.
-`pilots` prints how well a seed that is cut after a share of its steps predicts others, with the measure and without.
-`draw` draws predicted against observed regret of the second sealed set. `cost` prints the seconds of a cell and the
-memory that it adds, each in a process of its own that has compiled, by states of a grid, agent and observation.
+sealed-1; twice fourteen others: sealed-2 and sealed-3, blocks a to c) and computes the primary predictor of each cell,
+`huber_regret` of a DQN; those of a PPO and of sealed-3 are in the files of predictions. A row that is there already is
+not computed again. `judge` prints how well predictions agree with runs, by set and agent: number of cells, R2 of
+classes left out after a line, Spearman's rank correlation, the share of pairs of observations that are ordered rightly,
+R2 without a fit, half the width of the 80 % interval and the share of classes left out that it covers; in brackets 95 %
+intervals over classes drawn anew. Classes weigh alike. `orders` prints the pairs of observations by predicted
+difference. `sealed` prints the same of the second sealed test, by block and predictor, and what the interval of before
+it held. `collect` puts predictions and packed runs of the third one into its table of cells. `third` prints its result,
+and `huber_regret` beside `sampled_regret`. `pilots` prints how well a seed that is cut after a share of its steps
+predicts others in both last sets, with the measure and without. `draw` draws predicted against observed regret of the
+third sealed set. `cost` prints the seconds of a cell and the memory that it adds, each in a process of its own that has
+compiled, by states of a grid, agent and observation.
 """
 
 import argparse
@@ -53,6 +54,7 @@ DEV = STUDIES / "hardness-dev"
 BLOCKS = {
     "sealed-1": (STUDIES / "sealed-1" / "report.yaml", None, None),
     "sealed-2": (STUDIES / "sealed-2" / "report.yaml", None, None),
+    "sealed-3": (STUDIES / "sealed-3" / "study.yaml", None, None),
     "dev-main": (DEV / "main-dqn.yaml", DEV / "main-dqn-runs.parquet", None),
     "dev-random": (DEV / "random-dqn.yaml", DEV / "random-dqn-runs.parquet", None),
     "dev-long": (DEV / "long-dqn.yaml", DEV / "long-dqn-runs.parquet", None),
@@ -94,7 +96,7 @@ def observed_of(block, specification, runs):
     """CELL -> (mean greedy regret, seeds, V* - U) of the runs that are finished."""
     if runs is None:  # of a sealed set, whose table of cells is kept
         cells = pd.read_csv(STUDIES / block / "cells.csv")
-        if block != "sealed-1":  # plain, with the common hyperparameters: its primary test
+        if "part" in cells:  # plain, with the common hyperparameters: its primary test
             cells = cells[cells["part"].str[0].isin(["a", "b", "c"])]
     else:
         cells = cells_of(specification, runs)
@@ -147,13 +149,14 @@ def regret_of(run, cell, told):
 
 def judge(file, resamples):
     frame = pd.read_csv(file)
-    one, two = (frame["study"] == name for name in ("sealed-1", "sealed-2"))
+    one, two, three = (frame["study"] == name for name in ("sealed-1", "sealed-2", "sealed-3"))
     for agent in primary_predictors():
         for name, chosen in (
-            ("twelve of development", ~one & ~two),
+            ("twelve of development", ~one & ~two & ~three),
             ("the first fourteen sealed", one),
             ("the second fourteen sealed", two),
-            ("all 40", one | ~one),
+            ("the third fourteen sealed", three),
+            ("all 54", one | ~one),
         ):
             cells = frame[(frame["agent"] == agent) & chosen]
             if len(cells):
@@ -174,18 +177,20 @@ def orders(file):
             print(f"| {agent.upper()} | {words} | {' | '.join(map(str, values))} |")
 
 
+HALF_WIDTHS = {"dqn": 0.138714, "ppo": 0.20712}
+"""Of the intervals that `pharos predict` had when the second set was run: of the cells of before."""
 PREDICTORS = {
     "dqn": ("sampled_regret", "kernel_regret", "sampled_descent", "sampled_adam", "sampled_tabular"),
     "ppo": ("clipped_regret_evaluated", "policy_regret_evaluated", "kernel_regret", "clipped_tabular_regret"),
 }
 
 
-def sealed(file, resamples):
+def sealed(resamples):
     """The second sealed test: blocks a to c by predictor, then d and e, then what the interval of before held."""
-    frame, before = pd.read_csv(STUDIES / "sealed-2" / "cells.csv"), pd.read_csv(file)
+    frame = pd.read_csv(STUDIES / "sealed-2" / "cells.csv")
     for agent, predictors in PREDICTORS.items():
         mine = frame[frame["agent"].str.split().str[0] == agent]
-        width = of(before[(before["agent"] == agent) & (before["study"] != "sealed-2")]).half_width()
+        width = HALF_WIDTHS[agent]
         for blocks, names in (("abc", predictors), ("d", predictors[:1]), ("e", predictors[:1])):
             part = mine[mine["part"].str[0].isin([*blocks])]
             for name in names:
@@ -200,24 +205,46 @@ NAMED = {
 
 
 def third(resamples):
-    """The third sealed test: blocks a to c by predictor, each of them, the two groups of units, and block d."""
+    """The third sealed test by predictor: blocks a to c, block d, and the two groups of units."""
     frame = pd.read_csv(STUDIES / "sealed-3" / "cells.csv")
     for agent, widths in NAMED.items():
         mine = frame[frame["agent"] == agent]
-        tested = mine[mine["part"].str[0].isin([*"abc"])]
-        for name, width in widths.items():
-            print(row_of(tested, "abc", name, width, resamples))
-        groups = {"V\\* - U above 20": tested["spread"] > 20, "V\\* - U below 0.5": tested["spread"] < 0.5}
-        for name, width in [*widths.items()][:2]:
-            for blocks in "abcd":
-                part = mine[mine["part"].str[0] == blocks]
+        for blocks in ("abc", "d"):
+            part = mine[mine["part"].str[0].isin([*blocks])]
+            for name, width in widths.items():
                 if len(part):
                     print(row_of(part, blocks, name, width, resamples))
-            for words, chosen in groups.items():
-                error = (tested["greedy"] - tested[name])[chosen]
-                of_class = tested["environment"][chosen]
-                means = [each.groupby(of_class).mean().mean() for each in (error, error.abs())]
-                print(f"| {words} | {agent.upper()} | `{name}` | {len(error)} | {means[0]:+.2f} | {means[1]:.2f} |")
+    for agent, widths in NAMED.items():
+        tested = frame[(frame["agent"] == agent) & frame["part"].str[0].isin([*"abc"])]
+        groups = {"V\\* - U above 20": tested["spread"] > 20, "V\\* - U below 0.5": tested["spread"] < 0.5}
+        for words, chosen in groups.items():
+            for name in [*widths][:2]:
+                error, classes = (tested["greedy"] - tested[name])[chosen], tested["environment"][chosen]
+                mean, size = (each.groupby(classes).mean().mean() for each in (error, error.abs()))
+                print(f"| {words} | {agent.upper()} | `{name}` | {len(error)} | {mean:+.2f} | {size:.2f} |")
+
+
+def beside(file, resamples):
+    """DQN's predictor beside `sampled_regret`: R2 of classes left out of both, and the difference."""
+    frame, key = pd.read_csv(file), ["study", *CELL, "steps"]
+    frame = frame.merge(pd.read_csv(STUDIES / "sealed-3" / "sampled.csv"), on=key)
+    is_sealed = frame["study"].str.startswith("sealed")
+    rng = np.random.default_rng(0)
+    for words, chosen in (
+        ("the third sealed set", frame["study"] == "sealed-3"),
+        ("the second and third", frame["study"].isin(["sealed-2", "sealed-3"])),
+        ("all three sealed sets", is_sealed),
+        ("twelve of development", ~is_sealed),
+        ("all", is_sealed | ~is_sealed),
+    ):
+        cells = frame[chosen]
+        both = of(cells), of(cells.assign(predicted=cells["sampled_regret"]))
+        number = len(np.unique(both[0].classes))
+        drawn = [np.bincount(rng.choice(number, number), minlength=number) for _ in range(resamples)]
+        one, other = (statistics(each, np.array([np.ones(number, int), *drawn]))[0] for each in both)
+        low, high = np.quantile((one - other)[1:], [0.025, 0.975])
+        difference = f"{one[0] - other[0]:+.2f} ({low:+.2f} to {high:+.2f})"
+        print(f"| {len(cells)}, {words} | {number} | {one[0]:.2f} | {other[0]:.2f} | {difference} |")
 
 
 def row_of(part, blocks, name, width, resamples):
@@ -248,17 +275,37 @@ def said_of(cells, resamples):
 SHARES = (0.05, 0.1, 0.25, 0.5, 1.0)
 
 
+def regrets_of(name):
+    """(a row for each run of blocks a to c of a sealed set, (runs, evaluations) normalised regret)."""
+    source = STUDIES / name
+    if name == "sealed-2":
+        curves = pd.read_parquet(source / "curves.parquet")
+        curves = curves[curves["part"].str[0].isin(["a", "b", "c"])]
+        spread = (curves["value_optimal"] - curves["value_uniform"]).to_numpy()[:, None]
+        return curves[[*CELL, "seed"]], (
+            curves["value_optimal"].to_numpy()[:, None] - np.stack(curves["value"])
+        ) / spread
+    frames = []
+    for runs in sorted(source.glob("runs-*.parquet")):
+        with tempfile.TemporaryDirectory() as folder:
+            study.unpack(runs, Path(folder) / "runs", into=source / "study.yaml")
+            frames.append(study.curves(source / "study.yaml", Path(folder) / "runs"))
+    curves = pd.concat(frames)
+    wide = curves[curves["chance"] == "plain"].pivot(index=[*CELL, "seed"], columns="step", values="normalized_regret")
+    return wide.index.to_frame(index=False), wide.to_numpy()
+
+
 def pilot_cells(file):
-    """Cells of the second sealed set: the prediction, one seed's regret so far by share, and that of the others."""
-    frame, curves = pd.read_csv(file), pd.read_parquet(STUDIES / "sealed-2" / "curves.parquet")
-    curves = curves[curves["part"].str[0].isin(["a", "b", "c"])]
-    spread = curves["value_optimal"] - curves["value_uniform"]
-    regret = (curves["value_optimal"].to_numpy()[:, None] - np.stack(curves["value"])) / spread.to_numpy()[:, None]
-    share = np.linspace(0, 1, regret.shape[1])
-    so_far = {f"{part:.0%}": regret[:, share <= part + 1e-9].mean(axis=1) for part in SHARES}
-    cells = curves[[*CELL, "seed"]].assign(**so_far)
-    others = cells[cells["seed"] > 0].groupby(CELL)["100%"].mean().rename("others").reset_index()
-    return cells[cells["seed"] == 0].merge(others, on=CELL).merge(frame[frame["study"] == "sealed-2"], on=CELL)
+    """Cells of two sealed sets: the prediction, one seed's regret so far by share, and that of the others."""
+    frame, parts = pd.read_csv(file), []
+    for name in ("sealed-2", "sealed-3"):
+        runs, regret = regrets_of(name)
+        share = np.linspace(0, 1, regret.shape[1])
+        so_far = {f"{part:.0%}": regret[:, share <= part + 1e-9].mean(axis=1) for part in SHARES}
+        cells = runs.assign(**so_far)
+        others = cells[cells["seed"] > 0].groupby(CELL)["100%"].mean().rename("others").reset_index()
+        parts.append(cells[cells["seed"] == 0].merge(others, on=CELL).merge(frame[frame["study"] == name], on=CELL))
+    return pd.concat(parts)
 
 
 def r_squared_of_pilots(file):
@@ -280,7 +327,7 @@ def r_squared_of_pilots(file):
 
 
 def pilots(file, write=False):
-    """A pilot beside the measure on the second sealed set: one seed, cut after a share of its steps, for the others."""
+    """A pilot beside the measure on two sealed sets: one seed, cut after a share of its steps, for the others."""
     if write:
         cells = pilot_cells(file)
         kept = cells[[*CELL, "predicted", "others"]].assign(**{str(share): cells[f"{share:.0%}"] for share in PILOTS})
@@ -291,7 +338,7 @@ def pilots(file, write=False):
 
 
 def draw(file, picture):
-    """Predicted against observed on the second sealed set, a panel for each agent."""
+    """Predicted against observed on the third sealed set, a panel for each agent."""
     from pharos.plots import save
     from pharos.plots.style import GRID_COLOR, LINE_COLORS, panels, styled
 
@@ -300,15 +347,16 @@ def draw(file, picture):
         frame = pd.read_csv(file)
         drawn, axes = panels(2, 3.4, 3.3)
         for axis, agent in zip(axes, primary_predictors(), strict=True):
-            cells = frame[(frame["agent"] == agent) & (frame["study"] == "sealed-2")]
-            axis.plot([0, 1.8], [0, 1.8], color=GRID_COLOR, zorder=0)
+            cells = frame[(frame["agent"] == agent) & (frame["study"] == "sealed-3")]
+            most = 1.05 * cells[["predicted", "observed"]].to_numpy().max()
+            axis.plot([0, most], [0, most], color=GRID_COLOR, zorder=0)
             for number, (name, some) in enumerate(cells.groupby(cells["observation"].str.split("[(,]").str[0])):
                 label = name.replace("_", " ")
                 axis.scatter(
                     some["predicted"], some["observed"], 14, LINE_COLORS[number], label=label, alpha=0.8, linewidth=0
                 )
             axis.set(
-                xlim=(0, 1.8), ylim=(0, 1.8), xlabel="predicted regret", title=f"{agent.upper()}, {len(cells)} cells"
+                xlim=(0, most), ylim=(0, most), xlabel="predicted regret", title=f"{agent.upper()}, {len(cells)} cells"
             )
         axes[0].set_ylabel("observed regret")
         axes[0].legend(loc="upper left", handletextpad=0.2)
@@ -395,11 +443,12 @@ def main():
     elif arguments.task == "orders":
         orders(arguments.cells)
     elif arguments.task == "sealed":
-        sealed(arguments.cells, arguments.resamples)
+        sealed(arguments.resamples)
     elif arguments.task == "collect":
         collect("sealed-3")
     elif arguments.task == "third":
         third(arguments.resamples)
+        beside(arguments.cells, arguments.resamples)
     elif arguments.task == "pilots":
         pilots(arguments.cells, arguments.write)
     elif arguments.task == "cost":

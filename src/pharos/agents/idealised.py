@@ -38,8 +38,7 @@ class Idealised:
 
     Attributes:
         kind: "dqn", "ppo", "table" or "both", the one that the benchmark compares the agent with.
-        predictor: the column that stands for the agent, named on twelve development classes and fourteen sealed ones
-            together. Empty if there is none.
+        predictor: the column that stands for the agent, named before the runs of a sealed test. Empty if there is none.
         initialisation: of the network, see `pharos.observations.representation`.
         suffix: of the network's name.
     """
@@ -82,10 +81,10 @@ class Idealised:
 
 @dataclass(frozen=True, kw_only=True)
 class IdealisedDQN(Idealised):
-    """The learner that draws what a DQN draws: `sampled_regret`."""
+    """The learner that draws what a DQN draws, with its loss and its start: `huber_regret`."""
 
     kind: str = "dqn"
-    predictor: str = "sampled_regret"
+    predictor: str = "huber_regret"
     initialisation: str = "pytorch"
     suffix: str = ""
 
@@ -124,7 +123,7 @@ class IdealisedDQN(Idealised):
         return report(mdp, [name], schedule=self.schedule(config), sampling=sampling, **options)[name]
 
     def primary_columns(self, value: Mapping[str, Any] | None) -> dict[str, Any]:
-        return dict(self._parts(SAMPLED_PREDICTORS if self.predictor == "sampled_regret" else HUBER_PREDICTORS, value))
+        return dict(self._parts(HUBER_PREDICTORS, value))
 
     @staticmethod
     def _parts(names: Sequence[str], value: Mapping[str, Any] | None) -> Iterator[tuple[str, float]]:

@@ -52,7 +52,7 @@ def _with_one(x: np.ndarray) -> np.ndarray:
 
 @cache
 def plane(agent: str, share: float) -> Plane:
-    """Return the plane of an agent's pilots: of the second sealed test, 98 cells of 14 classes an agent.
+    """Return the plane of an agent's pilots: of the second and third sealed tests, 196 cells of 28 classes an agent.
 
     Raises:
         ParameterError: the share is none of PILOT_SHARES.

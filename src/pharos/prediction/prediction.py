@@ -212,7 +212,7 @@ def predict(
     """Predict the regret of an agent behind each of some observations, before anything is trained.
 
     The agent's network is replaced by its tangent kernel, and the agent by an idealised one that learns in it with the
-    same schedule: `sampled_regret` for a DQN, `kernel_policy_regret` with PPO's clipping, as it is evaluated, for a
+    same schedule: `huber_regret` for a DQN, `kernel_policy_regret` with PPO's clipping, as it is evaluated, for a
     PPO. How far that agrees with runs was tested on classes that nobody had used (docs/prediction.md).
 
     Args:
@@ -235,7 +235,7 @@ def predict(
     Raises:
         ParameterError: no such agent, observation or network, or more than MOST_STATES states.
         UndefinedMeasure: no policy beats uniform play, so that regret has no scale.
-    Cost: seconds for each cell of a thousand states, see `sampled_regret` and `kernel_policy_regret`. Measures are kept
+    Cost: seconds for each cell of a thousand states, see `huber_regret` and `kernel_policy_regret`. Measures are kept
         beside the state space.
     """
     from pharos.agents import hyperparameters as hyperparameters_of
