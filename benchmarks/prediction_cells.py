@@ -19,14 +19,15 @@ R2 without a fit, half the width of the 80 % interval and the share of classes l
 intervals over classes drawn anew. Classes weigh alike. `orders` prints the pairs of observations by predicted
 difference. `sealed` prints the same of the second sealed test, by block and predictor, and what the interval of before
 it held. `collect` puts predictions and packed runs of the third one into its table of cells. `third` prints its result,
-and `huber_regret` beside `sampled_regret`. `pilots` prints how well a seed that is cut after a share of its steps
-predicts others in both last sets, with the measure and without. `draw` draws predicted against observed regret of the
-third sealed set. `cost` prints the seconds of a cell and the memory that it adds, each in a process of its own that has
-compiled, by states of a grid, agent and observation.
+`huber_regret` beside `sampled_regret`, and what is missed by the unit of rewards. `pilots` prints how well a seed that
+is cut after a share of its steps predicts others in both last sets, with the measure and without. `draw` draws
+predicted against observed regret of the third sealed set. `cost` prints the seconds of a cell and the memory that it
+adds, each in a process of its own that has compiled, by states of a grid, agent and observation.
 """
 
 import argparse
 import csv
+import itertools
 import os
 import subprocess
 import sys
@@ -66,6 +67,7 @@ BLOCKS = {
     ),
 }  # fmt: skip
 SEEDS = 4
+UNITS = 0.0, 0.5, 1.0, 3.0, 10.0, 20.0, 50.0, np.inf
 COLUMNS = ("study", *CELL, "steps", "states", "spread", "predicted", "observed", "seeds")
 
 
@@ -245,6 +247,20 @@ def beside(file, resamples):
         low, high = np.quantile((one - other)[1:], [0.025, 0.975])
         difference = f"{one[0] - other[0]:+.2f} ({low:+.2f} to {high:+.2f})"
         print(f"| {len(cells)}, {words} | {number} | {one[0]:.2f} | {other[0]:.2f} | {difference} |")
+
+
+def units(file):
+    """Mean of observed less predicted regret by V* - U, classes weighing alike."""
+    frame = pd.read_csv(file)
+    frame["miss"] = frame["observed"] - frame["predicted"]
+    for low, high in itertools.pairwise(UNITS):
+        part = frame[(frame["spread"] >= low) & (frame["spread"] < high)]
+        words = f"{low:g} to {high:g}" if high < np.inf else f"{low:g} and more"
+        texts = [f"{part['environment'].nunique()}"]
+        for agent in primary_predictors():
+            of_agent = part[part["agent"] == agent]
+            texts.append(f"{of_agent.groupby('environment')['miss'].mean().mean() + 0.0:+.2f}")
+        print(f"| {words} | {' | '.join(texts)} |")
 
 
 def row_of(part, blocks, name, width, resamples):
@@ -449,6 +465,7 @@ def main():
     elif arguments.task == "third":
         third(arguments.resamples)
         beside(arguments.cells, arguments.resamples)
+        units(arguments.cells)
     elif arguments.task == "pilots":
         pilots(arguments.cells, arguments.write)
     elif arguments.task == "cost":

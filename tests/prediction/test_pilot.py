@@ -52,7 +52,7 @@ def test_a_plane_gives_back_a_plane_and_weighs_classes_alike():
 def test_published_pilots_are_those_of_the_page(agent):
     with pilot.PILOTS_FILE.open(newline="", encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file) if row["agent"] == agent]
-    assert len(rows) == 98 and len({row["environment"] for row in rows}) == 14
+    assert len(rows) == 196 and len({row["environment"] for row in rows}) == 28
     widths = [plane(agent, share).calibration.half_width() for share in PILOT_SHARES]
     said = re.search("± ([0-9., and]+) for " + agent.upper(), " ".join(PAGE.split()))[1]
     assert [float(each) for each in re.findall("[0-9.]+", said)] == [round(width, 2) for width in widths]

@@ -99,8 +99,8 @@ def test_counts_are_those_of_plain_loops_over_pairs(agent):
 @pytest.mark.parametrize("agent", primary_predictors())
 def test_published_cells_are_of_many_classes_and_sets(agent):
     known = published(agent)
-    assert len(set(known.classes)) == 40
-    assert len(known.predicted) >= 450
+    assert len(set(known.classes)) == 54
+    assert len(known.predicted) >= 550
     assert np.isfinite([known.predicted, known.observed, known.states, known.steps, known.spreads]).all()
     assert 0.74 <= known.coverage() <= 0.88
     counts = known.ordered(1.0)
@@ -137,13 +137,26 @@ def test_a_unit_outside_of_what_was_tested_is_named():
         assert len(lines) == is_outside and all("is V* less the value of uniform play" in line for line in lines)
 
 
+def test_a_unit_in_which_a_ppo_was_worse_than_predicted_is_named():
+    known = published("ppo")
+    missed = [known.observed - known.predicted, known.spreads >= prediction.LARGE_UNIT]
+    means = [
+        np.mean([missed[0][(known.classes == name) & where].mean() for name in np.unique(known.classes[where])])
+        for where in (missed[1], ~missed[1])
+    ]
+    assert [f"{mean:.2f}" for mean in means] == ["0.16", "0.09"]  # as the line and its constant say
+    for agent, spread, is_said in (("ppo", 50.0, True), ("ppo", 49.9, False), ("dqn", 1000.0, False)):
+        lines = list(prediction._large_unit(agent, spread))
+        assert len(lines) == is_said and all("worse than predicted by 0.16" in line for line in lines)
+
+
 def test_agents_without_published_runs_are_refused():
     with pytest.raises(ParameterError, match="agent 'a2c': no published runs to calibrate on; expected one of"):
         pharos.predict("river_swim", agent="a2c")
 
 
 @pytest.mark.long
-def test_a_dqn_is_predicted_by_the_sampled_learner_with_its_schedule():
+def test_a_dqn_is_predicted_by_the_learner_with_its_loss_and_schedule():
     answer = pharos.predict("river_swim", ["vector", ("hash", {"bits": 8})], length=5, sticky=0.1, **OPTIONS)
     space = pharos.build(pharos.make("river_swim", length=5))
     schedule = hardness.Schedule(
@@ -153,7 +166,7 @@ def test_a_dqn_is_predicted_by_the_sampled_learner_with_its_schedule():
         answer.cells, ({"observation": "vector"}, {"observation": "hash", "bits": 8}), strict=True
     ):
         mdp = pharos.sticky_actions(space.mdp(gamma=1.0).with_horizon(space.environment.max_episode_steps), 0.1)
-        expected = hardness.sampled_regret(
+        expected = hardness.huber_regret(
             mdp,
             representation(space, **options),
             schedule=schedule,
@@ -167,7 +180,7 @@ def test_a_dqn_is_predicted_by_the_sampled_learner_with_its_schedule():
         assert (entry["low"], entry["high"]) == (entry["lower"], entry["upper"])
     assert answer.half_width == published("dqn").half_width()
     assert [cell.observation for cell in answer.cells] == ["vector", "hash(bits=8)"]
-    assert answer.predictor == "sampled_regret" and answer.states == 5
+    assert answer.predictor == "huber_regret" and answer.states == 5
     assert any("sticky" in warning for warning in answer.warnings)
     assert any("1,000 steps" in warning for warning in answer.warnings)
     assert any("learning_starts, batch_size" in warning for warning in answer.warnings)

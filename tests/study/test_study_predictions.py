@@ -10,7 +10,7 @@ import pytest
 
 from command_line import run
 from pharos import hardness, study
-from pharos.agents import POLICY_PREDICTORS, SAMPLED_PREDICTORS, agent_called, hyperparameters
+from pharos.agents import HUBER_PREDICTORS, POLICY_PREDICTORS, agent_called, hyperparameters
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
 from pharos.hardness import registry
 from pharos.prediction import PREDICTORS, learners
@@ -57,13 +57,13 @@ def test_the_primary_predictor_alone_is_what_it_is_beside_the_others(predicted, 
     alone = study.predict(SPEC, tmp_path, primary=True)
     is_ppo = predicted["agent"] == "ppo"
     of_ppo = ["clipped_regret", "clipped_regret_evaluated", "clipped_tabular_regret", "clipped_curve"]
-    for rows, names in ((is_ppo, of_ppo), (~is_ppo, [*SAMPLED_PREDICTORS])):
+    for rows, names in ((is_ppo, of_ppo), (~is_ppo, [*HUBER_PREDICTORS])):
         both = ["instance", "agent", "observation", "network", "num_states", *names]
         pd.testing.assert_frame_equal(alone.loc[rows, both], predicted.loc[rows, both])
         assert alone.loc[rows, names].notna().all().all()
     assert alone[[*PREDICTORS[:-1], "policy_regret"]].isna().all().all()
     assert alone["estimated_error"].tolist() == [0.0] * 4  # small kernels are exact
-    assert alone["notes"].str.contains("sampled_regret: a mean over 3 walks").tolist() == [True, True, False, False]
+    assert alone["notes"].str.contains("huber_regret: a mean over 3 walks").tolist() == [True, True, False, False]
 
 
 def test_the_primary_predictor_of_an_agent_that_has_none_is_a_note(tmp_path):

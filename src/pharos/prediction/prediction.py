@@ -35,6 +35,8 @@ benchmarks/prediction_choices.py. What a wider network gains its kernel does not
 """
 LEAST_RIGHT = 0.75
 """Share of published pairs below which an order is not called."""
+LARGE_UNIT = 50.0
+"""V* - U from which on a PPO was worse than predicted on published cells by 0.16 in the mean, and below by 0.09."""
 MOST_STATES = 100_000
 """States beyond which a prediction is refused: its walks evaluate a policy of all states 31 times each."""
 
@@ -286,7 +288,11 @@ def predict(
         coverage=covering.coverage(),
         published_cells=len(covering.predicted),
         published_classes=len(set(covering.classes)),
-        warnings=(*_warnings(calibration, states, steps, spread, chance), *_other_hyperparameters(agent, settings)),
+        warnings=(
+            *_warnings(calibration, states, steps, spread, chance),
+            *_large_unit(agent, spread),
+            *_other_hyperparameters(agent, settings),
+        ),
         hyperparameters=settings,
     )
 
@@ -378,6 +384,16 @@ def _warnings(calibration: Published, states: int, steps: int, spread: float, ch
         untested.append("random above 0.1")
     if untested:
         yield f"{', '.join(untested)}: not among the tested cells, so the interval is not calibrated here"
+
+
+def _large_unit(agent: str, spread: float) -> Iterable[str]:
+    """A line if rewards are in a unit in which agents were worse than predicted: V* - U is LARGE_UNIT or more."""
+    if agent == "ppo" and spread >= LARGE_UNIT:
+        yield (
+            f"V* less the value of uniform play is {spread:,.6g}: a PPO was worse than predicted by 0.16 in the mean "
+            f"where it was {LARGE_UNIT:g} or more, and the prediction does not depend on the unit of rewards; "
+            "--scale-rewards range (in Python: scale_rewards='range') trains in a smaller one"
+        )
 
 
 def _other_hyperparameters(agent: str, settings: Mapping[str, Any]) -> Iterable[str]:
