@@ -14,6 +14,8 @@ from pharos.benchmark.contents import contents_of
 from pharos.benchmark.diagnosis_page import profile_rows
 from pharos.benchmark.examination import NAMES, solved, value_functions
 from pharos.benchmark.faults import ALIKE, FAMILIES, FAULTS, HEALTHY, alike, batch_of
+from pharos.benchmark.page import page
+from pharos.benchmark.play import LEARNT_REGRET, RANDOM_REGRET, baseline_play, late_play, late_regret
 from pharos.benchmark.profiles import (
     HEALTHY_ONES,
     SCORED_TASKS,
@@ -35,6 +37,7 @@ from pharos.benchmark.profiles import (
 from pharos.benchmark.results import AgentResults
 from pharos.benchmark.suite import load_suite
 from pharos.errors import ParameterError, TimeLimit
+from pharos.system.wording import pluralize
 from pharos.training import PolicyRecorder
 from refusals import failing
 
@@ -279,6 +282,29 @@ def worse(names, by=0.5, **more):
     return AgentResults("my dqn", "v1", shipped_dqn.digest, shipped_dqn.seeds, curves, more)
 
 
+def test_regret_of_play_is_that_of_plain_python():
+    rng = np.random.default_rng(6)
+    for evaluations in (1, 2, 10, 15):
+        returns = [rng.normal(0.5, 1, rng.integers(1, 9)) for _ in range(evaluations)]
+        episodes = np.cumsum([0, *map(len, returns)])
+        lost = np.cumsum([0, *(sum(0.9 - each) for each in returns)])
+        rows = [
+            {"episodes": n, "cumulative_realised_regret": x}
+            for n, x in zip(episodes.tolist(), lost.tolist(), strict=True)
+        ]
+        found = late_play(rows, {"value_optimal": 0.9, "value_uniform": 0.4})
+        last = returns[evaluations - round(evaluations / 3) :]
+        if not last:
+            assert found == {}
+            continue
+        flat = [float(x) for each in last for x in each]
+        assert found["episodes"] == len(flat)
+        assert found["regret"] == pytest.approx((0.9 - sum(flat) / len(flat)) / 0.5)
+        assert late_play(rows, {"value_optimal": 0.4, "value_uniform": 0.4}) == {}
+        assert late_play([{**row, "episodes": 3} for row in rows], {"value_optimal": 1.0, "value_uniform": 0.0}) == {}
+        assert late_play(rows, {"value_optimal": None, "value_uniform": 0.0}) == {}
+
+
 def readings_of(results):
     return [each.reading for each in findings_of(contents_of(results))]
 
@@ -451,6 +477,77 @@ def test_what_policies_are_like_is_a_symptom():
     assert readings_of(worse((), policies=fixed)) == ["one_action"]
     noisy = {noisy_one: {"one_action": 0.5, "deterministic": 0.0, "greedy_score": scores[noisy_one] + 0.3}}
     assert readings_of(worse((), policies=noisy)) == ["noise"]
+
+
+def learnt_tasks():
+    """Tasks that the shipped DQN has learnt at the end, and plays better than at random."""
+    whole = AgentResults.read("dqn")
+    play, late = baseline_play(whole), late_regret(whole)
+    return [name for name in play if play[name] <= LEARNT_REGRET and late[name] <= 0.3]
+
+
+def played(regret, tasks, results=None):
+    """The shipped DQN, or other results, with the same regret of play on some tasks."""
+    results = results or worse(())
+    record = {**results.record, "play": {name: {"regret": regret, "episodes": 400.0} for name in tasks}}
+    return replace(results, record=record)
+
+
+def test_random_play_at_the_end_is_a_symptom_of_who_has_learnt_something_else():
+    tasks = learnt_tasks()
+    assert len(tasks) > 10
+    for regret, is_wrong in ((1.0, True), (RANDOM_REGRET, True), (RANDOM_REGRET - 0.01, False), (0.2, False)):
+        assert readings_of(played(regret, tasks)) == ["random_play"] * is_wrong
+    said = diagnosis_of_results(contents_of(played(1.0, tasks)))
+    count = pluralize(len(tasks), "task")
+    assert said.verdict.startswith(
+        f"Something is wrong: it still plays at random at the end of training, on {count[:2]}"
+    )
+    assert f"of {count} that its policy has learnt, as DQN does not" in said.verdict
+    (line,) = findings_of(contents_of(played(1.0, tasks)))
+    assert line.faults == ("epsilon_stuck",) and "epsilon falls" in line.advice and line.value == 1.0
+    # a page says the same
+    text = "".join(page(contents_of(played(1.0, tasks))).split("What the policies are like")[1:])
+    assert "It still plays at random at the end of training" in text
+
+
+def test_random_play_at_the_end_is_no_symptom_if_nothing_is_learnt_or_the_baseline_plays_so_too():
+    tasks = learnt_tasks()
+    play = baseline_play(AgentResults.read("dqn"))
+    # half of the tasks is not most, two are too few
+    half = played(1.0, tasks[: len(tasks) // 2])
+    rest = {name: {"regret": 0.1, "episodes": 400.0} for name in tasks[len(tasks) // 2 :]}
+    half = replace(half, record={"play": {**half.record["play"], **rest}})
+    assert readings_of(half) == readings_of(played(1.0, tasks[:2])) == []
+    # its policies are as bad as its play: it has not learnt
+    failed_all = played(1.0, tasks, worse(tasks, by=1.0))
+    assert readings_of(failed_all) == ["everywhere"]
+    # the baseline plays these at random, too
+    hard = [name for name, regret in play.items() if regret > LEARNT_REGRET]
+    easy = worse(())
+    solved_all = replace(easy, curves={name: curve * 0 for name, curve in easy.curves.items()})
+    assert len(hard) >= 3 and readings_of(played(1.0, hard, solved_all)) == []
+
+
+def test_play_that_is_better_than_the_policy_that_is_judged_is_a_symptom():
+    tasks = learnt_tasks()
+    lost = worse(tasks, by=1.0)
+    gain = np.median([min(late_regret(lost)[name], 1.5) - 0.1 for name in tasks])
+    (line,) = [each for each in findings_of(contents_of(played(0.1, tasks, lost))) if each.reading == "played_better"]
+    assert line.value == pytest.approx(gain) and line.faults == ("action_off_by_one", "plays_at_random")
+    assert f"by {gain:.2f} of regret on the median of {len(tasks)} tasks" in line.wrong
+    assert "played_better" not in readings_of(played(0.9, tasks, lost))
+    assert "played_better" not in readings_of(played(0.1, tasks[:2], lost))
+    assert readings_of(played(0.0, tasks)) == []
+
+
+@pytest.mark.parametrize(
+    "play", [None, [], {"a": 1}, {"deep_sea-8-one_hot": 1}, {"deep_sea-8-one_hot": {"regret": "x"}}]
+)
+def test_results_without_play_are_diagnosed_as_before(play):
+    before, after = worse(()), worse((), play=play)
+    own, other = (diagnosis_of_results(contents_of(each)).to_dict() for each in (before, after))
+    assert own == other and not any(name.startswith("played_") for name in own["readings"])
 
 
 def test_a_finished_run_is_diagnosed_without_training(tmp_path, monkeypatch):

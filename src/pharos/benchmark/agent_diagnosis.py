@@ -36,6 +36,7 @@ from pharos.benchmark.diagnosis import (
 from pharos.benchmark.doctor import on_policy, readings
 from pharos.benchmark.examination import EXAMINATION_PROTOCOL, NAMES, Examination, examine
 from pharos.benchmark.faults import FAMILIES, FAULTS, HEALTHY, alike
+from pharos.benchmark.play import play_symptoms
 from pharos.benchmark.profiles import (
     BROKEN,
     CREDIBLE,
@@ -95,6 +96,8 @@ LOSS_SIGNS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     ),
 }
 """Groups of tasks and axes that one mistake hits: what to try, and the faults that they are a sign of."""
+PLAY_SIGNS = {"random_play": ("epsilon_stuck",), "played_better": ("action_off_by_one", "plays_at_random")}
+"""Symptoms of what an agent plays while it learns, and the faults that they are a sign of."""
 ABILITIES = ("exploration", "estimation", "credit")
 """Axes of LOSS_SIGNS: a healthy agent with a smaller network or other hyperparameters may lose on them alone."""
 WHERE = {"rewards of several sizes": "with rewards of several sizes", "ended by time alone": "ended by time alone"}
@@ -432,6 +435,9 @@ def findings_of(contents: Contents) -> list[Finding]:
         )
         share = len(below) / len(contents.agent.score.tasks)
         findings.append(Finding("below_random", share, 0.25, wrong, advice, 10 * share, ("action_off_by_one",)))
+    for symptom in play_symptoms(ours, other.results, other.name):
+        words, strength = (symptom.wrong, symptom.advice), 10 * symptom.value / symptom.largest
+        findings.append(Finding(symptom.name, symptom.value, symptom.limit, *words, strength, PLAY_SIGNS[symptom.name]))
     axes = {axis: own.score for axis, own in comparison.axes.items() if axis in LOSS_SIGNS}
     is_worse = [own.verdict == WORSE and own.interval.value <= -LOSS for own in axes.values()]
     if comparison.core is not None and comparison.core.verdict == WORSE and len(axes) > 1 and all(is_worse):

@@ -21,6 +21,7 @@ import numpy as np
 
 from pharos.benchmark.doctor import EQUATIONS
 from pharos.benchmark.faults import FAMILIES, HEALTHY, alike
+from pharos.benchmark.play import num_late
 
 PROFILES_FILE = Path(__file__).parent / "data" / "fault_profiles.csv"
 SCORES = PROFILES_FILE.with_name("fault_scores.csv")
@@ -31,7 +32,6 @@ SCORED_TASKS = (
     "umbrella_chain-22-hash",
 )
 """Tasks of the suite v1 whose scores tell faults apart."""
-LAST_THIRD = 1 / 3  # of the evaluations, that `late_` is about
 SIGN = 3.0  # times as likely as before is a fault that a finding is a sign of
 DECIMALS = 3
 LARGEST = 4.0  # deviations within a fault that a reading counts as being away
@@ -374,7 +374,7 @@ def run_readings(curves: Mapping[str, np.ndarray], policies: Mapping[str, Mappin
         there are facts on the policies of all of them, `one_action` and `deterministic`.
     """
     names = [name for name in SCORED_TASKS if name in curves]
-    late = {name: curves[name][:, -round(curves[name].shape[1] * LAST_THIRD) :].mean(axis=1) for name in names}
+    late = {name: curves[name][:, -num_late(curves[name].shape[1]) :].mean(axis=1) for name in names}
     numbers = {f"score_{name}": _score(curves[name].mean(axis=1)) for name in names}
     numbers |= {f"late_{name}": _score(late[name]) for name in names}
     if names:
