@@ -13,11 +13,12 @@ from pharos.benchmark.agent_diagnosis import diagnosis_of_results, findings_of, 
 from pharos.benchmark.contents import contents_of
 from pharos.benchmark.diagnosis_page import profile_rows
 from pharos.benchmark.examination import NAMES, solved, value_functions
-from pharos.benchmark.faults import ALIKE, FAMILIES, FAULTS, HEALTHY, alike, batch_of
+from pharos.benchmark.faults import ALIKE, ALIKE_BY_SCORES, FAMILIES, FAULTS, HEALTHY, alike, batch_of
 from pharos.benchmark.page import page
 from pharos.benchmark.play import LEARNT_REGRET, RANDOM_REGRET, baseline_play, late_play, late_regret
 from pharos.benchmark.profiles import (
     HEALTHY_ONES,
+    IMAGE_TASK,
     SCORED_TASKS,
     SCORES,
     SYMPTOMS,
@@ -330,34 +331,46 @@ def as_known(profile, agent):
     whole, numbers = AgentResults.read("dqn"), profile.readings
     curves = {name: np.full(curve.shape, 0.5) for name, curve in whole.curves.items()}
     worse_at = next((name for name in SCORED_TASKS if numbers[f"late_{name}"] == 0), None)
-    for name in SCORED_TASKS:
+    for name in (*SCORED_TASKS, IMAGE_TASK):
         late = 1 - numbers[f"late_{name}"] + 4 * numbers["worse"] * (name == worse_at)
         early = (15 * (1 - numbers[f"score_{name}"]) - 5 * late) / 10
         curves[name][:] = [early] * 10 + [late] * 5
     facts = {fact: numbers[fact] for fact in ("one_action", "deterministic")}
     record = {"source": {"name": "mine.py:learn"}, "policies": dict.fromkeys(SCORED_TASKS, facts)}
+    record["play"] = {
+        name: {"regret": 1 - numbers[f"played_{name}"], "episodes": 400.0} for name in (*SCORED_TASKS, IMAGE_TASK)
+    }
     return AgentResults(agent, "v1", whole.digest, whole.seeds, curves, record)
 
 
-def plain_readings(curves, policies):
+def plain_readings(curves, policies, play):
     """`run_readings` in plain Python."""
     numbers, worse_by = {}, []
-    for name in SCORED_TASKS:
+    for name in curves:
         runs = curves[name].tolist()
         numbers[f"score_{name}"] = sum(1 - min(1, max(0, sum(run) / 15)) for run in runs) / len(runs)
         last = [sum(run[10:]) / 5 for run in runs]
         numbers[f"late_{name}"] = sum(1 - min(1, max(0, each)) for each in last) / len(runs)
-        worse_by.append(sum(min(1, max(0, each - 1)) for each in last) / len(runs))
+        if name in play:
+            numbers[f"played_{name}"] = 1 - min(1, max(0, play[name]))
+        if name in SCORED_TASKS:
+            worse_by.append(sum(min(1, max(0, each - 1)) for each in last) / len(runs))
     numbers["worse"] = sum(worse_by) / 4
-    return numbers | {fact: sum(policies[name][fact] for name in SCORED_TASKS) / 4 for fact in policies[name]}
+    return numbers | {
+        fact: sum(policies[name][fact] for name in SCORED_TASKS) / 4 for fact in policies[SCORED_TASKS[0]]
+    }
 
 
 def test_readings_of_a_finished_run_are_those_of_plain_python():
     rng = np.random.default_rng(5)
     for _ in range(20):
-        curves = {name: rng.uniform(-0.2, 1.8, (3, 15)) for name in SCORED_TASKS}
+        names = (*SCORED_TASKS, IMAGE_TASK)[: rng.integers(4, 6)]
+        curves = {name: rng.uniform(-0.2, 1.8, (3, 15)) for name in names}
         policies = {name: {"one_action": rng.uniform(), "deterministic": rng.uniform()} for name in SCORED_TASKS}
-        assert run_readings(curves, policies) == pytest.approx(plain_readings(curves, policies))
+        play = {name: rng.uniform(-0.2, 1.8) for name in names[rng.integers(0, 4) :]}
+        for own in (play, {}):
+            assert run_readings(curves, policies, own) == pytest.approx(plain_readings(curves, policies, own))
+        assert run_readings(curves, policies) == run_readings(curves, policies, {"another task": 1.0})
         part = {name: policies[name] for name in SCORED_TASKS[1:]}
         assert (
             run_readings(curves, part).keys() == run_readings(curves, {}).keys() < run_readings(curves, policies).keys()
@@ -380,14 +393,23 @@ def test_a_finished_run_is_like_the_known_agents_with_its_readings():
         assert [*said.likeness.values()] == sorted(said.likeness.values(), reverse=True)
         names = frozenset(each.readings)
         assert said.accuracy == accuracy(each.kind, SCORES, names) == accuracy(each.kind, SCORES)
-        assert said.how_often.startswith("By what was learnt on 4 tasks")
+        assert said.how_often.startswith("By what was learnt and played on 5 tasks alone.")
         group = alike(each.kind, next(iter(said.likeness)))
         share = sum(said.likeness[fault] for fault in group)
         assert (f"apart, so read them as one ({share:.2f})" in said.how_often) == (len(group) > 1)
     for kind, words in FAULTS.items():
         assert {each.fault for each in table if each.kind == kind} == {HEALTHY, *words} - {"seeds_ignored"}
+        whole = frozenset(table[0].readings)
+        play = {name for name in whole if name.startswith("played_")}
+        image = {name for name in whole if IMAGE_TASK in name}
         facts = {"one_action", "deterministic"}
-        for names, more in ((None, ""), (frozenset(table[0].readings) - facts, ", no facts on policies")):
+        for names, more in (
+            (None, ""),
+            (whole - facts, ", no facts on policies"),
+            (whole - image, ", no image"),
+            (whole - play, ", no play"),
+            (whole - play - image, ", no play, no image"),
+        ):
             right = accuracy(kind, SCORES, names)
             assert right.three > 3 / len(words)  # better than a guess
             shares = right.first, right.three, right.healthy, right.unknown
@@ -399,11 +421,15 @@ def test_a_finished_run_is_like_the_known_agents_with_its_readings():
 
 
 def test_groups_of_faults_that_look_alike_are_of_the_table_and_apart():
-    for kind, groups in ALIKE.items():
-        names = [fault for group in groups for fault in group]
-        assert len(set(names)) == len(names) and {*names} <= {HEALTHY, *FAULTS[kind]}
-        assert all(alike(kind, fault) == group for group in groups for fault in group)
-    assert alike("dqn", "mean_backup") == ("mean_backup",) and alike("", HEALTHY) == (HEALTHY,)
+    for by_scores, table in ((False, ALIKE), (True, ALIKE_BY_SCORES)):
+        for kind, groups in table.items():
+            names = [fault for group in groups for fault in group]
+            assert len(set(names)) == len(names) and {*names} <= {HEALTHY, *FAULTS[kind]}
+            assert all(alike(kind, fault, by_scores=by_scores) == group for group in groups for fault in group)
+    assert alike("dqn", "mean_backup", by_scores=True) == ("mean_backup",) and alike("", HEALTHY) == (HEALTHY,)
+    # what was played tells an agent that plays at random from a healthy one, scores do not
+    assert alike("dqn", "epsilon_stuck") == ("epsilon_stuck",)
+    assert HEALTHY in alike("dqn", "epsilon_stuck", by_scores=True)
 
 
 def test_a_likeness_of_scores_says_a_fault_only_beside_a_sign_of_it():
@@ -414,7 +440,7 @@ def test_a_likeness_of_scores_says_a_fault_only_beside_a_sign_of_it():
         assert said.fault in (None, *(fault for finding in said.findings for fault in finding.faults))
     everywhere = replace(as_known(each, "my dqn"), curves=worse([task.name for task in load_suite("v1").tasks]).curves)
     lost = next(each for each in shipped(SCORES) if each.fault == "next_is_observation")
-    curves = {**everywhere.curves, **{name: as_known(lost, "").curves[name] for name in SCORED_TASKS}}
+    curves = {**everywhere.curves, **{name: as_known(lost, "").curves[name] for name in (*SCORED_TASKS, IMAGE_TASK)}}
     said = diagnosis_of_results(contents_of(replace(everywhere, curves=curves, record=as_known(lost, "").record)))
     assert said.fault == "next_is_observation" and "a run hardly tells target_never_copied, next_is_" in said.verdict
 
@@ -548,6 +574,19 @@ def test_results_without_play_are_diagnosed_as_before(play):
     before, after = worse(()), worse((), play=play)
     own, other = (diagnosis_of_results(contents_of(each)).to_dict() for each in (before, after))
     assert own == other and not any(name.startswith("played_") for name in own["readings"])
+
+
+def test_what_a_finished_run_lacks_is_no_part_of_its_likeness():
+    table = [each for each in shipped(SCORES) if each.kind == "dqn"]
+    more = {name for name in table[0].readings if name.startswith("played_") or IMAGE_TASK in name}
+    assert len(more) == 7  # play on five tasks, and two scores of the image
+    for each in table[::5]:
+        numbers = {name: value for name, value in each.readings.items() if name not in more}
+        rest = [
+            replace(other, readings={name: value for name, value in other.readings.items() if name not in more})
+            for other in table
+        ]
+        assert likeness(numbers, table) == likeness(numbers, rest)
 
 
 def test_a_finished_run_is_diagnosed_without_training(tmp_path, monkeypatch):

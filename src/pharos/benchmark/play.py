@@ -30,7 +30,7 @@ RANDOM_REGRET = 0.8  # of play, from which it looks like uniform play
 LEAST_TASKS = 3  # that count, for anything to be said
 SHARE_AT_RANDOM = 0.5  # share of tasks that are learnt and played at random, from which an agent is told so
 BETTER_PLAYED = 0.1  # of regret, by which play is better than the policies that are judged, on the median task
-CAPPED_REGRET = 1.5  # of policies, that counts
+CAPPED_REGRET = 1.5  # of policies, that counts; play that is better than optimal is luck, and counts as optimal
 
 
 def num_late(evaluations: int) -> int:
@@ -142,7 +142,7 @@ def play_symptoms(ours: "AgentResults", beside: "AgentResults", name: str) -> li
         )
         advice = "look whether epsilon falls, in how many steps, and whether exploration ends"
         symptoms.append(PlaySymptom("random_play", at_random / len(learnt), SHARE_AT_RANDOM, 1.0, wrong, advice))
-    gains = [min(policy, CAPPED_REGRET) - play for play, policy in pairs.values() if play <= LEARNT_REGRET]
+    gains = [min(policy, CAPPED_REGRET) - max(play, 0.0) for play, policy in pairs.values() if play <= LEARNT_REGRET]
     if len(gains) >= LEAST_TASKS and (gain := float(np.median(gains))) > BETTER_PLAYED:
         wrong = (
             f"what it plays at the end of training is better than the policy that is judged, by {gain:.2f} of regret "
