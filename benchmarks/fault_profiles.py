@@ -1,7 +1,7 @@
 """Profiles of known faults for `pharos diagnose`: readings of small agents, healthy ones and ones with a fault.
 
     python benchmarks/fault_profiles.py --rounds 3
-    python benchmarks/fault_profiles.py --rounds 2 --scores
+    python benchmarks/fault_profiles.py --rounds 3 --scores
     python benchmarks/fault_profiles.py --read DIR
 
 Each round has all faults once, each with hyperparameters and seeds of its own, and three healthy agents of each kind.
@@ -11,7 +11,7 @@ With `--read DIR` it runs nothing: of each finished run in a folder of DIR it pr
 `diagnose` say, beside the shipped DQN, as a row of a table.
 
 With `--scores` it writes fault_scores.csv beside it: what a finished run has of some tasks of v1, of all but agents
-whose seeds are ignored, and of two healthy ones a round. An agent takes about 3 s a task.
+whose seeds are ignored, and of two healthy ones a round. An agent takes about 2 s a task.
 """
 
 import argparse
@@ -31,6 +31,7 @@ from pharos.benchmark.diagnosis import (
     is_own,
     lowest_rungs,
     nearest,
+    play_sentences,
     policy_sentences,
     random_play,
     seeds_sentence,
@@ -39,7 +40,8 @@ from pharos.benchmark.diagnosis import (
 )
 from pharos.benchmark.doctor import readings
 from pharos.benchmark.examination import NAMES, examine
-from pharos.benchmark.profiles import DECIMALS, PROFILES_FILE, SCORED_TASKS, SCORES, run_readings
+from pharos.benchmark.play import late_play
+from pharos.benchmark.profiles import DECIMALS, IMAGE_TASK, PROFILES_FILE, SCORED_TASKS, SCORES, run_readings
 from pharos.training.budget import generated_curve
 
 FURTHER = 100  # between numbers of the healthy agents of a round
@@ -79,17 +81,18 @@ def examinations(agent, fault, number):
 
 
 def scores(agent, fault, number):
-    """Readings of one agent's runs of SCORED_TASKS, with one seed."""
-    suite, curves, policies = load_suite("v1"), {}, {}
+    """Readings of one agent's runs of SCORED_TASKS and the image, with one seed."""
+    suite, curves, policies, play = load_suite("v1"), {}, {}, {}
     protocol = suite.protocol
-    for name in SCORED_TASKS:
+    for name in (*SCORED_TASKS, IMAGE_TASK):
         learn = faults.faulty_agent(agent, fault, **setting(agent, fault, number))
         options = {"steps": protocol.steps, "evaluations": protocol.evaluations, "seed": 10 * number}
         with np.errstate(all="ignore"):
             curve = generated_curve(learn, suite.task(name).check(protocol), **options)
         curves[name] = np.array([[row["normalized_regret"] for row in curve.rows[1:]]])
         policies[name] = curve.policies
-    return run_readings(curves, policies)
+        play[name] = late_play(curve.rows, curve.result())
+    return run_readings(curves, policies, {name: facts["regret"] for name, facts in play.items() if facts})
 
 
 def write(rows, file=PROFILES_FILE):
@@ -122,6 +125,7 @@ def told(folder):
     own_words += [*lowest_rungs(contents), *worst_groups(tables, groups, ours, theirs)]
     own_words += [suspicion(ours, theirs, groups)]
     own_words += [text for text in policy_sentences(contents) if not text.startswith("Deterministic")]
+    own_words += play_sentences(contents)
     residuals = [task.name for task, own, _ in residual_tasks(contents) if is_own(contents, task, own.value)]
     own_words += [f"Residuals of its own: {', '.join(residuals)}."] if residuals else []
     said = diagnosis_of_results(contents)

@@ -384,7 +384,8 @@ def finished(tmp_path_factory):
     names = [*SCORED_TASKS, "umbrella_chain-8", "umbrella_chain-16"]
     facts = {name: {"one_action": 0.5, "deterministic": 0.0, "greedy_score": 0.5} for name in names}
     record = {"agent": "mine", "suite": "v1", "suite_digest": whole.digest, "seeds": [0, 1, 2]}
-    record |= {"record": {**RECORD, "policies": facts, "failed": {"a": "why"}}}
+    play = {name: {"regret": 0.1, "episodes": 400.0} for name in names}
+    record |= {"record": {**RECORD, "policies": facts, "play": play, "failed": {"a": "why"}}}
     curves = {name: whole.curves[name][:3] for name in names}
     folder = tmp_path_factory.mktemp("finished")
     write_sealed(folder / RESULTS_FILE, record, curves, RESULTS_KIND)
@@ -453,11 +454,14 @@ def test_results_that_are_diagnosed_and_are_others(finished, tmp_path, count):
     assert tally.counts["refused"] == tally.total, tally.failures
     values = [value for value in (*NUMBERS, *OTHERS) if value == value and value not in (np.inf, "\ud800")]
     same = repr([True, True, True])
-    sealed(record={"record": {**record["record"], "policies": {}}})
-    without, whole_said = diagnosed(tmp_path / "r"), whole  # facts on policies that cannot be read are none
-    assert without["scores"] == whole["scores"] and without["readings"].items() < whole["readings"].items()
+    without, whole_said = {}, whole
+    for name in ("policies", "play"):  # facts on policies, and what was played, are none if they cannot be read
+        sealed(record={"record": {**record["record"], name: {}}})
+        without[name] = diagnosed(tmp_path / "r")
+        assert without[name]["scores"] == whole["scores"]
+        assert without[name]["readings"].items() < whole["readings"].items()
     for name, value in itertools.product(record["record"], values[::2]):
-        whole = without if name == "policies" else whole_said
+        whole = without.get(name, whole_said)
         with suppress(ValueError):  # no file has such a number
             sealed(record={"record": {**record["record"], name: value}})
             tally.note(f"{name} {str(value)[:20]}", *outcome(read, (same,)))
@@ -468,6 +472,16 @@ def test_results_that_are_diagnosed_and_are_others(finished, tmp_path, count):
         tally.note(
             f"{name} {value}", *outcome(lambda: diagnosed(tmp_path / "r")["findings"], (repr(whole["findings"]),))
         )
+    for value in ("x", None, [], True):
+        play = {each: {"regret": value, "episodes": 400.0} for each in record["record"]["play"]}
+        whole = without["play"]
+        sealed(record={"record": {**record["record"], "play": play}})
+        tally.note(f"regret {value}", *outcome(read, (same,)))
+    for value in (-1e300, -1, 2, 1e300):  # no run has these, and they say no more than the ends of what one may have
+        play = {each: {"regret": value, "episodes": 400.0} for each in record["record"]["play"]}
+        sealed(record={"record": {**record["record"], "play": play}})
+        numbers = diagnosed(tmp_path / "r")["readings"]
+        assert {x for each, x in numbers.items() if each.startswith("played_")} == {float(value < 1)}
     count(f"{tally.total} other results that are diagnosed: {tally}")
     tally.check()
     assert tally.total >= 60

@@ -89,6 +89,38 @@ def test_the_oracle_has_no_regret_and_random_play_all_of_it(suite, tmp_path):
         assert said["core"]["value"] == found.score.value and said["agent"] == name
 
 
+def test_results_have_the_regret_of_returns_of_the_last_third(suite, tmp_path):
+    """Of an agent that writes down its returns, and whose policy is another one than what it plays."""
+    (tmp_path / "noted.py").write_text(
+        "def learn(env, steps, seed):\n"
+        "    observation, _ = env.reset(seed=seed)\n"
+        "    total, returns = 0.0, []\n"
+        "    for step in range(steps):\n"
+        "        _, reward, terminated, truncated, _ = env.step(1)\n"
+        "        total += reward\n"
+        "        if terminated or truncated:\n"
+        "            returns += [total] * (step >= 200)\n"
+        "            total = 0.0\n"
+        "            env.reset()\n"
+        f"    with open(f'{tmp_path}/returns-{{observation.size}}-{{seed}}', 'w') as file:\n"
+        "        file.write(repr(returns))\n"
+        "    yield lambda seen: [0] * len(seen)\n"
+    )
+    found = benchmark.run(f"{tmp_path / 'noted.py'}:learn", suite, out=tmp_path / "runs", seeds=range(2))
+    play = found.results.record["play"]
+    assert set(play) == {task.name for task in suite.tasks}
+    for task, size in zip(suite.tasks, (9, 2, 11), strict=True):
+        values = task.training_task(suite.protocol).reference
+        returns = [json.loads((tmp_path / f"returns-{size}-{seed}").read_text()) for seed in range(2)]
+        lost = [(values.optimal - sum(each) / len(each)) / (values.optimal - values.uniform) for each in returns]
+        assert play[task.name]["regret"] == pytest.approx(sum(lost) / 2)
+        assert play[task.name]["episodes"] == sum(map(len, returns)) / 2
+
+
+def test_of_what_solves_and_does_not_play_there_is_no_play(suite, tmp_path):
+    assert "play" not in benchmark.run("oracle", suite, out=tmp_path, seeds=range(2)).results.record
+
+
 @pytest.mark.long
 def test_a_run_answers_with_scores_intervals_and_the_steps_that_were_used(suite, tmp_path):
     """Of 300 steps an agent that stops after 20 uses 20; Q-learning uses all."""

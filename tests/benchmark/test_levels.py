@@ -119,7 +119,7 @@ def test_levels_is_four_generators_with_three_numbers_of_levels():
 
 def test_its_baselines_are_of_it_and_score_as_the_evidence_says():
     suite = load_suite("levels")
-    titles = {"q_learning": "Q-learning", "ppo": "PPO"}
+    titles = {"q_learning": "Q-learning", "dqn": "DQN", "ppo": "PPO"}
     assert set(baselines("levels")) == set(titles)
     for name, title in titles.items():
         results = read_results(f"levels/{name}")

@@ -13,9 +13,12 @@ from pharos.benchmark.agent_diagnosis import diagnosis_of_results, findings_of, 
 from pharos.benchmark.contents import contents_of
 from pharos.benchmark.diagnosis_page import profile_rows
 from pharos.benchmark.examination import NAMES, solved, value_functions
-from pharos.benchmark.faults import ALIKE, FAMILIES, FAULTS, HEALTHY, alike, batch_of
+from pharos.benchmark.faults import ALIKE, ALIKE_BY_SCORES, FAMILIES, FAULTS, HEALTHY, alike, batch_of
+from pharos.benchmark.page import page
+from pharos.benchmark.play import LEARNT_REGRET, RANDOM_REGRET, baseline_play, late_play, late_regret
 from pharos.benchmark.profiles import (
     HEALTHY_ONES,
+    IMAGE_TASK,
     SCORED_TASKS,
     SCORES,
     SYMPTOMS,
@@ -35,6 +38,7 @@ from pharos.benchmark.profiles import (
 from pharos.benchmark.results import AgentResults
 from pharos.benchmark.suite import load_suite
 from pharos.errors import ParameterError, TimeLimit
+from pharos.system.wording import pluralize
 from pharos.training import PolicyRecorder
 from refusals import failing
 
@@ -279,6 +283,29 @@ def worse(names, by=0.5, **more):
     return AgentResults("my dqn", "v1", shipped_dqn.digest, shipped_dqn.seeds, curves, more)
 
 
+def test_regret_of_play_is_that_of_plain_python():
+    rng = np.random.default_rng(6)
+    for evaluations in (1, 2, 10, 15):
+        returns = [rng.normal(0.5, 1, rng.integers(1, 9)) for _ in range(evaluations)]
+        episodes = np.cumsum([0, *map(len, returns)])
+        lost = np.cumsum([0, *(sum(0.9 - each) for each in returns)])
+        rows = [
+            {"episodes": n, "cumulative_realised_regret": x}
+            for n, x in zip(episodes.tolist(), lost.tolist(), strict=True)
+        ]
+        found = late_play(rows, {"value_optimal": 0.9, "value_uniform": 0.4})
+        last = returns[evaluations - round(evaluations / 3) :]
+        if not last:
+            assert found == {}
+            continue
+        flat = [float(x) for each in last for x in each]
+        assert found["episodes"] == len(flat)
+        assert found["regret"] == pytest.approx((0.9 - sum(flat) / len(flat)) / 0.5)
+        assert late_play(rows, {"value_optimal": 0.4, "value_uniform": 0.4}) == {}
+        assert late_play([{**row, "episodes": 3} for row in rows], {"value_optimal": 1.0, "value_uniform": 0.0}) == {}
+        assert late_play(rows, {"value_optimal": None, "value_uniform": 0.0}) == {}
+
+
 def readings_of(results):
     return [each.reading for each in findings_of(contents_of(results))]
 
@@ -304,34 +331,46 @@ def as_known(profile, agent):
     whole, numbers = AgentResults.read("dqn"), profile.readings
     curves = {name: np.full(curve.shape, 0.5) for name, curve in whole.curves.items()}
     worse_at = next((name for name in SCORED_TASKS if numbers[f"late_{name}"] == 0), None)
-    for name in SCORED_TASKS:
+    for name in (*SCORED_TASKS, IMAGE_TASK):
         late = 1 - numbers[f"late_{name}"] + 4 * numbers["worse"] * (name == worse_at)
         early = (15 * (1 - numbers[f"score_{name}"]) - 5 * late) / 10
         curves[name][:] = [early] * 10 + [late] * 5
     facts = {fact: numbers[fact] for fact in ("one_action", "deterministic")}
     record = {"source": {"name": "mine.py:learn"}, "policies": dict.fromkeys(SCORED_TASKS, facts)}
+    record["play"] = {
+        name: {"regret": 1 - numbers[f"played_{name}"], "episodes": 400.0} for name in (*SCORED_TASKS, IMAGE_TASK)
+    }
     return AgentResults(agent, "v1", whole.digest, whole.seeds, curves, record)
 
 
-def plain_readings(curves, policies):
+def plain_readings(curves, policies, play):
     """`run_readings` in plain Python."""
     numbers, worse_by = {}, []
-    for name in SCORED_TASKS:
+    for name in curves:
         runs = curves[name].tolist()
         numbers[f"score_{name}"] = sum(1 - min(1, max(0, sum(run) / 15)) for run in runs) / len(runs)
         last = [sum(run[10:]) / 5 for run in runs]
         numbers[f"late_{name}"] = sum(1 - min(1, max(0, each)) for each in last) / len(runs)
-        worse_by.append(sum(min(1, max(0, each - 1)) for each in last) / len(runs))
+        if name in play:
+            numbers[f"played_{name}"] = 1 - min(1, max(0, play[name]))
+        if name in SCORED_TASKS:
+            worse_by.append(sum(min(1, max(0, each - 1)) for each in last) / len(runs))
     numbers["worse"] = sum(worse_by) / 4
-    return numbers | {fact: sum(policies[name][fact] for name in SCORED_TASKS) / 4 for fact in policies[name]}
+    return numbers | {
+        fact: sum(policies[name][fact] for name in SCORED_TASKS) / 4 for fact in policies[SCORED_TASKS[0]]
+    }
 
 
 def test_readings_of_a_finished_run_are_those_of_plain_python():
     rng = np.random.default_rng(5)
     for _ in range(20):
-        curves = {name: rng.uniform(-0.2, 1.8, (3, 15)) for name in SCORED_TASKS}
+        names = (*SCORED_TASKS, IMAGE_TASK)[: rng.integers(4, 6)]
+        curves = {name: rng.uniform(-0.2, 1.8, (3, 15)) for name in names}
         policies = {name: {"one_action": rng.uniform(), "deterministic": rng.uniform()} for name in SCORED_TASKS}
-        assert run_readings(curves, policies) == pytest.approx(plain_readings(curves, policies))
+        play = {name: rng.uniform(-0.2, 1.8) for name in names[rng.integers(0, 4) :]}
+        for own in (play, {}):
+            assert run_readings(curves, policies, own) == pytest.approx(plain_readings(curves, policies, own))
+        assert run_readings(curves, policies) == run_readings(curves, policies, {"another task": 1.0})
         part = {name: policies[name] for name in SCORED_TASKS[1:]}
         assert (
             run_readings(curves, part).keys() == run_readings(curves, {}).keys() < run_readings(curves, policies).keys()
@@ -354,14 +393,23 @@ def test_a_finished_run_is_like_the_known_agents_with_its_readings():
         assert [*said.likeness.values()] == sorted(said.likeness.values(), reverse=True)
         names = frozenset(each.readings)
         assert said.accuracy == accuracy(each.kind, SCORES, names) == accuracy(each.kind, SCORES)
-        assert said.how_often.startswith("By what was learnt on 4 tasks")
+        assert said.how_often.startswith("By what was learnt and played on 5 tasks alone.")
         group = alike(each.kind, next(iter(said.likeness)))
         share = sum(said.likeness[fault] for fault in group)
         assert (f"apart, so read them as one ({share:.2f})" in said.how_often) == (len(group) > 1)
     for kind, words in FAULTS.items():
         assert {each.fault for each in table if each.kind == kind} == {HEALTHY, *words} - {"seeds_ignored"}
+        whole = frozenset(table[0].readings)
+        play = {name for name in whole if name.startswith("played_")}
+        image = {name for name in whole if IMAGE_TASK in name}
         facts = {"one_action", "deterministic"}
-        for names, more in ((None, ""), (frozenset(table[0].readings) - facts, ", no facts on policies")):
+        for names, more in (
+            (None, ""),
+            (whole - facts, ", no facts on policies"),
+            (whole - image, ", no image"),
+            (whole - play, ", no play"),
+            (whole - play - image, ", no play, no image"),
+        ):
             right = accuracy(kind, SCORES, names)
             assert right.three > 3 / len(words)  # better than a guess
             shares = right.first, right.three, right.healthy, right.unknown
@@ -373,11 +421,15 @@ def test_a_finished_run_is_like_the_known_agents_with_its_readings():
 
 
 def test_groups_of_faults_that_look_alike_are_of_the_table_and_apart():
-    for kind, groups in ALIKE.items():
-        names = [fault for group in groups for fault in group]
-        assert len(set(names)) == len(names) and {*names} <= {HEALTHY, *FAULTS[kind]}
-        assert all(alike(kind, fault) == group for group in groups for fault in group)
-    assert alike("dqn", "mean_backup") == ("mean_backup",) and alike("", HEALTHY) == (HEALTHY,)
+    for by_scores, table in ((False, ALIKE), (True, ALIKE_BY_SCORES)):
+        for kind, groups in table.items():
+            names = [fault for group in groups for fault in group]
+            assert len(set(names)) == len(names) and {*names} <= {HEALTHY, *FAULTS[kind]}
+            assert all(alike(kind, fault, by_scores=by_scores) == group for group in groups for fault in group)
+    assert alike("dqn", "mean_backup", by_scores=True) == ("mean_backup",) and alike("", HEALTHY) == (HEALTHY,)
+    # what was played tells an agent that plays at random from a healthy one, scores do not
+    assert alike("dqn", "epsilon_stuck") == ("epsilon_stuck",)
+    assert HEALTHY in alike("dqn", "epsilon_stuck", by_scores=True)
 
 
 def test_a_likeness_of_scores_says_a_fault_only_beside_a_sign_of_it():
@@ -388,7 +440,7 @@ def test_a_likeness_of_scores_says_a_fault_only_beside_a_sign_of_it():
         assert said.fault in (None, *(fault for finding in said.findings for fault in finding.faults))
     everywhere = replace(as_known(each, "my dqn"), curves=worse([task.name for task in load_suite("v1").tasks]).curves)
     lost = next(each for each in shipped(SCORES) if each.fault == "next_is_observation")
-    curves = {**everywhere.curves, **{name: as_known(lost, "").curves[name] for name in SCORED_TASKS}}
+    curves = {**everywhere.curves, **{name: as_known(lost, "").curves[name] for name in (*SCORED_TASKS, IMAGE_TASK)}}
     said = diagnosis_of_results(contents_of(replace(everywhere, curves=curves, record=as_known(lost, "").record)))
     assert said.fault == "next_is_observation" and "a run hardly tells target_never_copied, next_is_" in said.verdict
 
@@ -451,6 +503,90 @@ def test_what_policies_are_like_is_a_symptom():
     assert readings_of(worse((), policies=fixed)) == ["one_action"]
     noisy = {noisy_one: {"one_action": 0.5, "deterministic": 0.0, "greedy_score": scores[noisy_one] + 0.3}}
     assert readings_of(worse((), policies=noisy)) == ["noise"]
+
+
+def learnt_tasks():
+    """Tasks that the shipped DQN has learnt at the end, and plays better than at random."""
+    whole = AgentResults.read("dqn")
+    play, late = baseline_play(whole), late_regret(whole)
+    return [name for name in play if play[name] <= LEARNT_REGRET and late[name] <= 0.3]
+
+
+def played(regret, tasks, results=None):
+    """The shipped DQN, or other results, with the same regret of play on some tasks."""
+    results = results or worse(())
+    record = {**results.record, "play": {name: {"regret": regret, "episodes": 400.0} for name in tasks}}
+    return replace(results, record=record)
+
+
+def test_random_play_at_the_end_is_a_symptom_of_who_has_learnt_something_else():
+    tasks = learnt_tasks()
+    assert len(tasks) > 10
+    for regret, is_wrong in ((1.0, True), (RANDOM_REGRET, True), (RANDOM_REGRET - 0.01, False), (0.2, False)):
+        assert readings_of(played(regret, tasks)) == ["random_play"] * is_wrong
+    said = diagnosis_of_results(contents_of(played(1.0, tasks)))
+    count = pluralize(len(tasks), "task")
+    assert said.verdict.startswith(
+        f"Something is wrong: it still plays at random at the end of training, on {count[:2]}"
+    )
+    assert f"of {count} that its policy has learnt, as DQN does not" in said.verdict
+    (line,) = findings_of(contents_of(played(1.0, tasks)))
+    assert line.faults == ("epsilon_stuck",) and "epsilon falls" in line.advice and line.value == 1.0
+    # a page says the same
+    text = "".join(page(contents_of(played(1.0, tasks))).split("What the policies are like")[1:])
+    assert "It still plays at random at the end of training" in text
+
+
+def test_random_play_at_the_end_is_no_symptom_if_nothing_is_learnt_or_the_baseline_plays_so_too():
+    tasks = learnt_tasks()
+    play = baseline_play(AgentResults.read("dqn"))
+    # half of the tasks is not most, two are too few
+    half = played(1.0, tasks[: len(tasks) // 2])
+    rest = {name: {"regret": 0.1, "episodes": 400.0} for name in tasks[len(tasks) // 2 :]}
+    half = replace(half, record={"play": {**half.record["play"], **rest}})
+    assert readings_of(half) == readings_of(played(1.0, tasks[:2])) == []
+    # its policies are as bad as its play: it has not learnt
+    failed_all = played(1.0, tasks, worse(tasks, by=1.0))
+    assert readings_of(failed_all) == ["everywhere"]
+    # the baseline plays these at random, too
+    hard = [name for name, regret in play.items() if regret > LEARNT_REGRET]
+    easy = worse(())
+    solved_all = replace(easy, curves={name: curve * 0 for name, curve in easy.curves.items()})
+    assert len(hard) >= 3 and readings_of(played(1.0, hard, solved_all)) == []
+
+
+def test_play_that_is_better_than_the_policy_that_is_judged_is_a_symptom():
+    tasks = learnt_tasks()
+    lost = worse(tasks, by=1.0)
+    gain = np.median([min(late_regret(lost)[name], 1.5) - 0.1 for name in tasks])
+    (line,) = [each for each in findings_of(contents_of(played(0.1, tasks, lost))) if each.reading == "played_better"]
+    assert line.value == pytest.approx(gain) and line.faults == ("action_off_by_one", "plays_at_random")
+    assert f"by {gain:.2f} of regret on the median of {len(tasks)} tasks" in line.wrong
+    assert "played_better" not in readings_of(played(0.9, tasks, lost))
+    assert "played_better" not in readings_of(played(0.1, tasks[:2], lost))
+    assert readings_of(played(0.0, tasks)) == []
+
+
+@pytest.mark.parametrize(
+    "play", [None, [], {"a": 1}, {"deep_sea-8-one_hot": 1}, {"deep_sea-8-one_hot": {"regret": "x"}}]
+)
+def test_results_without_play_are_diagnosed_as_before(play):
+    before, after = worse(()), worse((), play=play)
+    own, other = (diagnosis_of_results(contents_of(each)).to_dict() for each in (before, after))
+    assert own == other and not any(name.startswith("played_") for name in own["readings"])
+
+
+def test_what_a_finished_run_lacks_is_no_part_of_its_likeness():
+    table = [each for each in shipped(SCORES) if each.kind == "dqn"]
+    more = {name for name in table[0].readings if name.startswith("played_") or IMAGE_TASK in name}
+    assert len(more) == 7  # play on five tasks, and two scores of the image
+    for each in table[::5]:
+        numbers = {name: value for name, value in each.readings.items() if name not in more}
+        rest = [
+            replace(other, readings={name: value for name, value in other.readings.items() if name not in more})
+            for other in table
+        ]
+        assert likeness(numbers, table) == likeness(numbers, rest)
 
 
 def test_a_finished_run_is_diagnosed_without_training(tmp_path, monkeypatch):

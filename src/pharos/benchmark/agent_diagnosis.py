@@ -36,6 +36,7 @@ from pharos.benchmark.diagnosis import (
 from pharos.benchmark.doctor import on_policy, readings
 from pharos.benchmark.examination import EXAMINATION_PROTOCOL, NAMES, Examination, examine
 from pharos.benchmark.faults import FAMILIES, FAULTS, HEALTHY, alike
+from pharos.benchmark.play import play_of, play_symptoms
 from pharos.benchmark.profiles import (
     BROKEN,
     CREDIBLE,
@@ -49,6 +50,7 @@ from pharos.benchmark.profiles import (
     accuracy,
     families,
     has_no_memory,
+    has_scores_alone,
     is_on_policy,
     judged,
     kind_of,
@@ -95,6 +97,8 @@ LOSS_SIGNS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     ),
 }
 """Groups of tasks and axes that one mistake hits: what to try, and the faults that they are a sign of."""
+PLAY_SIGNS = {"random_play": ("epsilon_stuck",), "played_better": ("action_off_by_one", "plays_at_random")}
+"""Symptoms of what an agent plays while it learns, and the faults that they are a sign of."""
 ABILITIES = ("exploration", "estimation", "credit")
 """Axes of LOSS_SIGNS: a healthy agent with a smaller network or other hyperparameters may lose on them alone."""
 WHERE = {"rewards of several sizes": "with rewards of several sizes", "ended by time alone": "ended by time alone"}
@@ -152,8 +156,10 @@ class Diagnosis:
         """A sentence on how far the likeness can be trusted."""
         right = self.accuracy
         if right.agents and self.from_results:
+            tasks = sum(name.startswith("late_") for name in self.readings)
+            played = " and played" * any(name.startswith("played_") for name in self.readings)
             return (
-                f"By what was learnt on {pluralize(len(SCORED_TASKS), 'task')} alone. Of {right.agents} agents of one "
+                f"By what was learnt{played} on {pluralize(tasks, 'task')} alone. Of {right.agents} agents of one "
                 f"author, each left out of the table in turn, the fault was the likeliest for {right.first:.0%}, "
                 f"among three for {right.three:.0%}; health was the likeliest for {right.healthy:.0%} of the healthy "
                 f"ones. {self._alike}It is right less often for other code. Values say more: `pharos diagnose AGENT`."
@@ -167,10 +173,14 @@ class Diagnosis:
             f"right family, for {right.unknown:.0%}."
         )
 
+    def group_of(self, fault: str) -> tuple[str, ...]:
+        """The faults that a finished run hardly tells from a fault, which is among them."""
+        return alike(self.kind, fault, by_scores=has_scores_alone(self.readings))
+
     @property
     def _alike(self) -> str:
         """A sentence on the faults that a finished run hardly tells from the likeliest, or empty."""
-        group = alike(self.kind, next(iter(self.likeness), ""))
+        group = self.group_of(next(iter(self.likeness), ""))
         if len(group) == 1:
             return ""
         names = listed(["healthy" if name == HEALTHY else name for name in group])
@@ -321,7 +331,7 @@ def _diagnosis(
 def _verdict(diagnosis: Diagnosis) -> str:
     fault, shares = diagnosis.fault, diagnosis.likeness
     like = f"it is most like an agent in which {meanings(diagnosis.kind)[fault]} ({shares[fault]:.2f})" if fault else ""
-    if fault and diagnosis.from_results and len(group := alike(diagnosis.kind, fault)) > 1:
+    if fault and diagnosis.from_results and len(group := diagnosis.group_of(fault)) > 1:
         names = listed(["a healthy one" if name == HEALTHY else name for name in group])
         like += f"; a run hardly tells {names} apart"
     if diagnosis.findings:
@@ -347,7 +357,7 @@ def diagnosis_of_results(contents: Contents) -> Diagnosis:
     _check_curves(contents)
     scores = {name: float(runs.mean()) for name, runs in run_scores(results).items()}
     findings = sorted(findings_of(contents), key=lambda each: -each.strength)
-    numbers, lacks = run_readings(results.curves, policies_of(results)), missing_tasks(contents)
+    numbers, lacks = run_readings(results.curves, policies_of(results), play_of(results)), missing_tasks(contents)
     answer = Judgement(tuple(findings), {}, None, False)
     if not lacks:
         shares = with_signs(likeness(numbers, library_of(kind, SCORES)), findings)
@@ -432,6 +442,9 @@ def findings_of(contents: Contents) -> list[Finding]:
         )
         share = len(below) / len(contents.agent.score.tasks)
         findings.append(Finding("below_random", share, 0.25, wrong, advice, 10 * share, ("action_off_by_one",)))
+    for symptom in play_symptoms(ours, other.results, other.name):
+        words, strength = (symptom.wrong, symptom.advice), 10 * symptom.value / symptom.largest
+        findings.append(Finding(symptom.name, symptom.value, symptom.limit, *words, strength, PLAY_SIGNS[symptom.name]))
     axes = {axis: own.score for axis, own in comparison.axes.items() if axis in LOSS_SIGNS}
     is_worse = [own.verdict == WORSE and own.interval.value <= -LOSS for own in axes.values()]
     if comparison.core is not None and comparison.core.verdict == WORSE and len(axes) > 1 and all(is_worse):

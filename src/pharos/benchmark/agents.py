@@ -37,6 +37,8 @@ from pharos.agents import (
     generator_of,
     is_known,
 )
+from pharos.benchmark.levels import has_held_out
+from pharos.benchmark.play import late_play
 from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite
 from pharos.errors import ParameterError, PharosError
 from pharos.solvers import uniform_policy
@@ -123,6 +125,7 @@ class RunResult:
         steps: of the environment, as it counted them, else of the protocol.
         notes: sentences on what looks like a mistake, by kind.
         policies: facts on the policies, by `policy_facts` of training/curve.py, or empty if they are unknown.
+        play: regret of what it played in the last third, by `play.late_play`, or empty.
     """
 
     curve: np.ndarray
@@ -130,6 +133,7 @@ class RunResult:
     steps: int
     notes: Mapping[str, str] = field(default_factory=dict)
     policies: Mapping[str, Any] = field(default_factory=dict)
+    play: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -174,12 +178,14 @@ class Form:
         rows = {row["step"]: row for row in read_rows(job.folder)}
         rows_at = [rows[protocol.evaluation_interval * (i + 1)] for i in range(protocol.evaluations)]
         counted, notes = record["result"].get("counted_steps"), record.get("notes")
+        has_play = 0 in rows and not has_held_out(job.task)  # whose episodes begin where no value is measured
         return RunResult(
             np.array([row["normalized_regret"] for row in rows_at]),
             all(row["exact"] for row in rows_at),
             protocol.steps if counted is None else int(counted),
             {str(kind): str(text) for kind, text in notes.items()} if isinstance(notes, Mapping) else {},
             record.get("policies") or {},
+            late_play([rows[0], *rows_at], record["result"]) if has_play else {},
         )
 
 

@@ -32,6 +32,7 @@ from pharos.benchmark.contents import (
     signed,
 )
 from pharos.benchmark.levels import twins
+from pharos.benchmark.play import play_symptoms
 from pharos.benchmark.properties import known_properties
 from pharos.benchmark.results import AgentResults, baselines
 from pharos.benchmark.scores import ConfidenceInterval, equal_seeds, run_scores
@@ -382,3 +383,12 @@ def seeds_sentence(agents: Sequence[ScoredAgent]) -> list[str]:
     """A sentence on each agent whose seeds are one run: the first paragraph of a page on it."""
     texts = [(each.name, equal_seeds(each.results.curves)) for each in agents]
     return [f"{name}: {text}. Here nothing of it has an interval or a verdict." for name, text in texts if text]
+
+
+def play_sentences(contents: Contents) -> list[str]:
+    """Sentences on what an agent played at the end of training, beside the nearest baseline. Most have none."""
+    if (near := nearest(contents)) is None:
+        return []
+    other = contents.beside[near[0]]
+    symptoms = play_symptoms(contents.agent.results, other.results, other.name)
+    return [f"{each.wrong[0].upper()}{each.wrong[1:]}: {each.advice}." for each in symptoms]

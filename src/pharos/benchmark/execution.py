@@ -20,6 +20,7 @@ import numpy as np
 
 from pharos.agents import COMPILED
 from pharos.benchmark.agents import Form, Job, OnProgress, RunSettings, agent_form
+from pharos.benchmark.play import mean_play
 from pharos.benchmark.results import RESULTS_FILE, AgentResults
 from pharos.benchmark.scores import AxisScore, BenchmarkScore, ConfidenceInterval, equal_seeds, score
 from pharos.benchmark.suite import CORE, EARLIER, BenchmarkTask, Suite, load_suite
@@ -215,6 +216,7 @@ def collected(folder: Path, form: Form, suite: Suite, record: Mapping[str, Any],
     missing: dict[str, str] = {}
     notes: dict[str, dict[str, str]] = {}
     facts: dict[str, list[Mapping[str, Any]]] = {}
+    play: dict[str, list[Mapping[str, float]]] = {}
     seeds, steps = tuple(dict.fromkeys(job.seed for job in jobs)), 0
     for job in jobs:
         task, which = job.task.name, job.id
@@ -229,12 +231,14 @@ def collected(folder: Path, form: Form, suite: Suite, record: Mapping[str, Any],
         curves.setdefault(task, []).append(result.curve)
         exact[task] = exact.get(task, True) and result.exact
         facts.setdefault(task, []).append(result.policies)
+        play.setdefault(task, []).append(result.play)
     whole = {task: np.stack(each) for task, each in curves.items() if len(each) == len(seeds)}
     if (text := equal_seeds(whole)) and form.learns:
         notes["equal seeds"] = {pluralize(len(whole), "task"): text}
     full_record = {**record, "exact": {task: exact[task] for task in whole}, "steps_used": steps}
     policies = {task: mean_facts(facts[task], whole[task]) for task in whole if all(facts[task])}
-    optional = {"failed": missing, "notes": notes, "policies": policies}
+    earned = {task: means for task in whole if (means := mean_play(play[task]))}
+    optional = {"failed": missing, "notes": notes, "policies": policies, "play": earned}
     full_record |= {name: value for name, value in optional.items() if value}
     results = AgentResults(str(record["agent"]), suite.name, suite.digest, seeds, whole, full_record)
     outcome = Outcome(results, folder, missing, suite, steps, notes)

@@ -75,19 +75,38 @@ FAMILIES = {
 """Families of faults: name -> what they are about, and which."""
 ALIKE = {
     "dqn": (
+        ("truncation_as_end", "replay_too_small", "mean_backup", "rewards_clipped"),
+        ("last_feature_lost", "terminal_bootstrapped"),
+        ("learning_rate_high", "frames_reshaped"),
+        ("target_never_copied", "next_is_observation", "rewards_shifted"),
+    ),
+    "ppo": (
+        (HEALTHY, "truncation_as_end", "entropy_penalised"),
+        ("advantages_not_normalised", "value_without_mask"),
+        ("learning_rate_high", "stale_log_probabilities", "rollout_reshaped"),
+    ),
+}
+"""Faults by agent that a finished run hardly tells apart, nor from health. Each other one is alone."""
+ALIKE_BY_SCORES = {
+    "dqn": (
         (HEALTHY, "bytes_not_divided", "epsilon_stuck", "replay_too_small", "truncation_as_end"),
         ("last_feature_lost", "terminal_bootstrapped"),
         ("learning_rate_high", "frames_reshaped"),
         ("target_never_copied", "next_is_observation", "learning_rate_low", "gamma_half", "rewards_shifted"),
     ),
-    "ppo": ((HEALTHY, "truncation_as_end"),),
+    "ppo": ALIKE["ppo"],
 }
-"""Faults by agent that a finished run hardly tells apart, nor from health. Each other one is alone."""
+"""The same of a run that has no image, or of which nobody knows what was played."""
 
 
-def alike(agent: str, fault: str) -> tuple[str, ...]:
-    """The faults that a finished run of an agent hardly tells from a fault, which is among them."""
-    return next((group for group in ALIKE.get(agent, ()) if fault in group), (fault,))
+def alike(agent: str, fault: str, *, by_scores: bool = False) -> tuple[str, ...]:
+    """The faults that a finished run of an agent hardly tells from a fault, which is among them.
+
+    Args:
+        by_scores: whether the run has no image, or nobody knows what was played.
+    """
+    groups = (ALIKE_BY_SCORES if by_scores else ALIKE).get(agent, ())
+    return next((group for group in groups if fault in group), (fault,))
 
 
 def faulty_agent(

@@ -108,12 +108,17 @@ def _cropped(images: np.ndarray) -> np.ndarray:
     return images[:, :, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
 
 
+def has_held_out(task: "BenchmarkTask") -> bool:
+    """Whether a task measures on levels that no episode of training begins in."""
+    return task.environment == ENVIRONMENT_NAME and bool(task.parameters["held_out"])
+
+
 def twins(suite: "Suite") -> list[tuple["BenchmarkTask", "BenchmarkTask"]]:
     """Pairs of tasks on the same training levels, measured on these and on held-out ones, in the suite's order."""
     unsplit = {
         json.dumps({**task.parameters, "held_out": 0}, sort_keys=True): task
         for task in suite.tasks
-        if task.environment == ENVIRONMENT_NAME and not task.parameters["held_out"]
+        if task.environment == ENVIRONMENT_NAME and not has_held_out(task)
     }
     pairs = []
     for task in suite.tasks:

@@ -59,6 +59,7 @@ from pharos.benchmark.diagnosis import (
     level_gaps,
     lowest_rungs,
     nearest,
+    play_sentences,
     policies_of,
     policy_sentences,
     predictor_sentence,
@@ -264,7 +265,7 @@ def _purposes(contents: Contents) -> Element | None:
 
 
 def _policies(contents: Contents) -> Element | None:
-    sentences = policy_sentences(contents)
+    sentences = [*policy_sentences(contents), *play_sentences(contents)]
     if not sentences:
         return None
     scores, facts = contents.agent.score.tasks, policies_of(contents.agent.results)
@@ -278,11 +279,14 @@ def _policies(contents: Contents) -> Element | None:
                 *(f"{100 * own[each]:.0f} %" for each in ("one_action", "deterministic")),
             )
             rows.append([_task(task), *cells])
+    heading = "What the policies are like"
+    if not rows:
+        return section(heading, "", bullets(sentences))
     rows.sort(key=lambda row: -float(str(row[3]).removesuffix(" %")))
     heads = ["task", "score", "played greedily", "one action in", "runs that end deterministic"]
     table = element("details", element("summary", "Task by task"), html_table(heads, rows, numeric=(1, 2, 3, 4)))
     return section(
-        "What the policies are like",
+        heading,
         "Of all states of a task that are not terminal, reached or not. Played greedily: the most probable action of "
         "each snapshot, evaluated exactly.",
         bullets(sentences),
@@ -470,5 +474,5 @@ SECTIONS: tuple[Callable[[Contents], Element | None], ...] = (
 )
 
 
-ON_PAGE = ("exact", "division", "steps_used", "failed", "notes", "policies")
+ON_PAGE = ("exact", "division", "steps_used", "failed", "notes", "policies", "play")
 """Entries of the record that the page says in words."""

@@ -6,21 +6,24 @@ extreme healthy agents in it, with a margin, so that no healthy agent of the tab
 The likeness of a fault is its probability by linear discriminant analysis among all faults of the agent's kind. An
 agent that is far from all of them is like none of the known ones.
 
-`data/fault_scores.csv` has the `run_readings` of the same agents on `SCORED_TASKS` of the suite v1, for finished runs.
+`data/fault_scores.csv` has the `run_readings` of the same agents on `SCORED_TASKS` and `IMAGE_TASK` of the suite v1,
+for finished runs.
 
 Source: Friedman (1989), Regularized discriminant analysis.
 """
 
 import csv
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
 from pharos.benchmark.doctor import EQUATIONS
 from pharos.benchmark.faults import FAMILIES, HEALTHY, alike
+from pharos.benchmark.play import num_late
 
 PROFILES_FILE = Path(__file__).parent / "data" / "fault_profiles.csv"
 SCORES = PROFILES_FILE.with_name("fault_scores.csv")
@@ -30,8 +33,9 @@ SCORED_TASKS = (
     "deep_sea-8-one_hot",
     "umbrella_chain-22-hash",
 )
-"""Tasks of the suite v1 whose scores tell faults apart."""
-LAST_THIRD = 1 / 3  # of the evaluations, that `late_` is about
+"""Tasks of the suite v1 whose scores tell faults apart. A run that lacks one is not compared."""
+IMAGE_TASK = "simple_grid-4-4-simple_image"
+"""The core task of v1 that is seen as an image. It is compared if the run has it."""
 SIGN = 3.0  # times as likely as before is a fault that a finding is a sign of
 DECIMALS = 3
 LARGEST = 4.0  # deviations within a fault that a reading counts as being away
@@ -362,27 +366,40 @@ def shipped(file: Path = PROFILES_FILE) -> tuple[Profile, ...]:
         )
 
 
-def run_readings(curves: Mapping[str, np.ndarray], policies: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
+def run_readings(
+    curves: Mapping[str, np.ndarray],
+    policies: Mapping[str, Mapping[str, float]],
+    play: Mapping[str, float] = MappingProxyType({}),
+) -> dict[str, float]:
     """Numbers of a finished run that are held against those of known faults.
 
     Args:
         curves: (runs, evaluations) normalised regret of each task.
         policies: facts on the policies of each task, see `training.policy_facts`, means over its runs.
+        play: regret of play of each task in the last third of the run, see `play.play_of`.
     Returns:
-        Of each of SCORED_TASKS that was run `score_` and its name, and `late_`, the same of the last third of the
-        evaluations. Means over them: `worse`, regret beyond that of uniform play in the last third, at most 1. If
-        there are facts on the policies of all of them, `one_action` and `deterministic`.
+        Of each of SCORED_TASKS and IMAGE_TASK that was run `score_` and its name, `late_`, the same of the last third
+        of the evaluations, and `played_`, 1 less the regret of play. Means over SCORED_TASKS: `worse`, regret beyond
+        that of uniform play in the last third, at most 1. If there are facts on the policies of all of them,
+        `one_action` and `deterministic`.
     """
     names = [name for name in SCORED_TASKS if name in curves]
-    late = {name: curves[name][:, -round(curves[name].shape[1] * LAST_THIRD) :].mean(axis=1) for name in names}
-    numbers = {f"score_{name}": _score(curves[name].mean(axis=1)) for name in names}
-    numbers |= {f"late_{name}": _score(late[name]) for name in names}
+    tasks = [*names, IMAGE_TASK] if IMAGE_TASK in curves else names
+    late = {name: curves[name][:, -num_late(curves[name].shape[1]) :].mean(axis=1) for name in tasks}
+    numbers = {f"score_{name}": _score(curves[name].mean(axis=1)) for name in tasks}
+    numbers |= {f"late_{name}": _score(late[name]) for name in tasks}
+    numbers |= {f"played_{name}": _score(np.array([play[name]])) for name in tasks if name in play}
     if names:
         numbers["worse"] = float(np.mean([np.clip(late[name] - 1, 0, 1).mean() for name in names]))
     if names and all(name in policies for name in names):
         for fact in ("one_action", "deterministic"):
             numbers[fact] = float(np.mean([policies[name][fact] for name in names]))
     return numbers
+
+
+def has_scores_alone(names: Collection[str]) -> bool:
+    """Whether the readings of a finished run lack the image, or what was played."""
+    return not {f"late_{IMAGE_TASK}", f"played_{IMAGE_TASK}"} <= {*names}
 
 
 def _score(regrets: np.ndarray) -> float:
@@ -529,6 +546,7 @@ def accuracy(kind: str, file: Path = PROFILES_FILE, names: frozenset[str] | None
         for each in shipped(file)
         if each.kind == kind
     ]
+    by_scores = has_scores_alone(frozenset(library[0].readings) if library else frozenset())
     ranks, healthy, unknown, in_group = [], [], [], []
     for index, each in enumerate(library):
         rest = library[:index] + library[index + 1 :]
@@ -540,9 +558,10 @@ def accuracy(kind: str, file: Path = PROFILES_FILE, names: frozenset[str] | None
             healthy.append(is_healthy if file == PROFILES_FILE else next(iter(answer.shares)) == HEALTHY)
             continue
         ranks.append([*answer.shares].index(each.fault))
-        groups = {alike(kind, fault): 0.0 for fault in answer.shares}
+        group_of = {fault: alike(kind, fault, by_scores=by_scores) for fault in answer.shares}
+        groups = dict.fromkeys(group_of.values(), 0.0)
         for fault, share in answer.shares.items():
-            groups[alike(kind, fault)] += share
+            groups[group_of[fault]] += share
         in_group.append(each.fault in max(groups, key=groups.__getitem__))
         answer = judged(each.readings, [other for other in rest if other.fault != each.fault])
         own = {fault for _, faults in FAMILIES.values() if each.fault in faults for fault in faults}
