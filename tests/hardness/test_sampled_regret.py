@@ -333,6 +333,22 @@ def test_regret_of_a_random_network_is_not_cut_and_a_report_has_it():
     assert found.to_dict()["conventions"]["clipped"] == {}
 
 
+@pytest.mark.parametrize("of", [huber_regret, sampled_regret])
+def test_a_scale_of_rewards_is_another_unit_of_them_and_noise_is_not_divided(of):
+    kernel, mdp = np.asarray(kernel_of(7), np.float64), random_mdp(7, 2)
+    seen = seen_with(kernel, kernel / 50)
+    for noise in (0.0, 0.5):
+        options = {"schedule": SHORT, "sampling": Sampling(walks=1, reward_noise=noise)}
+        smaller = of(mdp.with_rewards(mdp.rewards / 8), seen, **options)
+        options["sampling"] = replace(options["sampling"], reward_scale=8.0)
+        scaled = of(mdp, seen, **options)
+        assert scaled.descent.greedy == pytest.approx(smaller.descent.greedy, abs=1e-9)
+        assert scaled.conventions["sampling"]["reward_scale"] == 8 and "reward_scale" not in str(smaller.conventions)
+    for scale in (0.0, -1.0, math.inf, math.nan):
+        with pytest.raises(ParameterError, match=r"reward_scale is .*; expected a number above 0"):
+            Sampling(reward_scale=scale)
+
+
 def test_without_the_covariance_of_outputs_it_is_undefined():
     with pytest.raises(UndefinedMeasure, match="huber_regret needs the covariance of the network's outputs"):
         huber_regret(random_mdp(7, 1), Representation.of_matrix(np.eye(7)), schedule=SHORT)

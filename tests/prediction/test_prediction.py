@@ -137,6 +137,17 @@ def test_a_unit_outside_of_what_was_tested_is_named():
         assert len(lines) == is_outside and all("is V* less the value of uniform play" in line for line in lines)
 
 
+@pytest.mark.slow
+def test_a_dqn_is_predicted_in_the_unit_that_it_is_paid_in():
+    world = {"length": 5, "steps": 3000, "common": True}
+    plain, by_number, by_range = (
+        pharos.predict("river_swim", **world, scale_rewards=scale).cells[0].value for scale in ("", 250.0, "range")
+    )
+    spread = pharos.training.Task.of("river_swim", {"length": 5}).reference.spread()
+    assert by_range == pharos.predict("river_swim", **world, scale_rewards=spread).cells[0].value
+    assert len({plain, by_number, by_range}) == 3
+
+
 def test_a_unit_in_which_a_ppo_was_worse_than_predicted_is_named():
     known = published("ppo")
     missed = [known.observed - known.predicted, known.spreads >= prediction.LARGE_UNIT]

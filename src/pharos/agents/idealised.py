@@ -5,7 +5,7 @@ Each says which network stands for the agent's, what it draws, and which columns
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -104,34 +104,23 @@ class IdealisedDQN(Idealised):
         return int(config["hyperparameters"].get("learning_starts", 0)) + 1, "learning begins"
 
     def columns(self, config: Configuration, mdp: "TabularMDP", options: Mapping[str, Any]) -> dict[str, Any]:
-        columns = SAMPLED_PREDICTORS, HUBER_PREDICTORS
-        results = (self._result(names[0], config, mdp, options) for names in columns)
-        return dict(
-            pair for names, result in zip(columns, results, strict=True) for pair in self._parts(names, result.value)
-        )
+        sampled = self._result("sampled_regret", config, mdp, options).value
+        return {**_parts(SAMPLED_PREDICTORS, sampled), **self.primary_columns(self.primary(config, mdp, options).value)}
 
     def primary(self, config: Configuration, mdp: "TabularMDP", options: Mapping[str, Any]) -> "Result":
         return self._result(self.predictor, config, mdp, options)
 
-    def _result(self, name: str, config: Configuration, mdp: "TabularMDP", options: Mapping[str, Any]) -> "Result":
+    def _result(self, measure: str, config: Configuration, mdp: "TabularMDP", options: Mapping[str, Any]) -> "Result":
         from pharos.hardness import Sampling, report
 
         hyperparameters, chance = config["hyperparameters"], config["chance"]
         sizes = {name: int(hyperparameters[name]) for name in ("batch_size", "buffer_size") if name in hyperparameters}
         noise, scale = float(chance.get("reward_noise", 0.0)), float(chance.get("scale_rewards") or 1.0)
         sampling = Sampling(reward_noise=noise, reward_scale=scale, **sizes)
-        return report(mdp, [name], schedule=self.schedule(config), sampling=sampling, **options)[name]
+        return report(mdp, [measure], schedule=self.schedule(config), sampling=sampling, **options)[measure]
 
     def primary_columns(self, value: Mapping[str, Any] | None) -> dict[str, Any]:
-        return dict(self._parts(HUBER_PREDICTORS, value))
-
-    @staticmethod
-    def _parts(names: Sequence[str], value: Mapping[str, Any] | None) -> Iterator[tuple[str, float]]:
-        """Pairs of columns and numbers."""
-        if value is None:
-            value = dict.fromkeys(("value", "deviation", "descent", "adam", "tabular"), math.nan)
-        parts = (value["value"], value.get("deviation", math.nan), value["descent"], value["adam"], value["tabular"])
-        return zip(names, parts, strict=True)
+        return _parts(HUBER_PREDICTORS, value)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,6 +187,13 @@ class IdealisedActorCritic(Idealised):
         from pharos.hardness import LearningCurve
 
         return LearningCurve(**{name: np.asarray(values) for name, values in value["curve"].items()}).mean_evaluated
+
+
+def _parts(names: Sequence[str], value: Mapping[str, Any] | None) -> dict[str, float]:
+    """Columns of a sampled learner's value: the mean, one walk's deviation, both kernels, a table. NaN if None."""
+    parts = ("value", "deviation", "descent", "adam", "tabular")
+    numbers = dict.fromkeys(parts, math.nan) | dict(value or {})
+    return {name: numbers[part] for name, part in zip(names, parts, strict=True)}
 
 
 def curve_points(regret: Mapping[str, Any], of: str = "greedy") -> str:
