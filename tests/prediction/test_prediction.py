@@ -11,7 +11,7 @@ import pytest
 import pharos
 from command_line import run
 from pharos import hardness, importers
-from pharos.agents import primary_predictors
+from pharos.agents import agent_called, primary_predictors
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.observations import representation
 from pharos.prediction import Published, prediction, published
@@ -150,12 +150,13 @@ def test_a_dqn_is_predicted_in_the_unit_that_it_is_paid_in():
 
 def test_a_unit_in_which_a_ppo_was_worse_than_predicted_is_named():
     known = published("ppo")
-    missed = [known.observed - known.predicted, known.spreads >= prediction.LARGE_UNIT]
+    idealised = agent_called("ppo").idealised
+    missed = [known.observed - known.predicted, known.spreads >= idealised.large_unit]
     means = [
         np.mean([missed[0][(known.classes == name) & where].mean() for name in np.unique(known.classes[where])])
         for where in (missed[1], ~missed[1])
     ]
-    assert [f"{mean:.2f}" for mean in means] == ["0.16", "0.09"]  # as the line and its constant say
+    assert [f"{mean:.2f}" for mean in means] == [str(idealised.large_unit_miss), "0.09"]
     for agent, spread, is_said in (("ppo", 50.0, True), ("ppo", 49.9, False), ("dqn", 1000.0, False)):
         lines = list(prediction._large_unit(agent, spread))
         assert len(lines) == is_said and all("worse than predicted by 0.16" in line for line in lines)

@@ -41,12 +41,16 @@ class Idealised:
         predictor: the column that stands for the agent, named before the runs of a sealed test. Empty if there is none.
         initialisation: of the network, see `pharos.observations.representation`.
         suffix: of the network's name.
+        large_unit, large_unit_miss: V* - U from which on the agent was worse than predicted on published cells, and by
+            how much regret in the mean. The prediction does not depend on the unit of rewards.
     """
 
     kind: str = "both"
     predictor: str = ""
     initialisation: str = "sb3"
     suffix: str = "+tanh"
+    large_unit: float = math.inf
+    large_unit_miss: float = 0.0
 
     def schedule(self, config: Configuration) -> "Schedule":
         """The schedule of the agent."""

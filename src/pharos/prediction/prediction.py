@@ -35,8 +35,6 @@ benchmarks/prediction_choices.py. What a wider network gains its kernel does not
 """
 LEAST_RIGHT = 0.75
 """Share of published pairs below which an order is not called."""
-LARGE_UNIT = 50.0
-"""V* - U from which on a PPO was worse than predicted on published cells by 0.16 in the mean, and below by 0.09."""
 MOST_STATES = 100_000
 """States beyond which a prediction is refused: its walks evaluate a policy of all states 31 times each."""
 
@@ -387,11 +385,13 @@ def _warnings(calibration: Published, states: int, steps: int, spread: float, ch
 
 
 def _large_unit(agent: str, spread: float) -> Iterable[str]:
-    """A line if rewards are in a unit in which agents were worse than predicted: V* - U is LARGE_UNIT or more."""
-    if agent == "ppo" and spread >= LARGE_UNIT:
+    """A line if rewards are in a unit in which the agent was worse than predicted (`Idealised.large_unit`)."""
+    idealised = agent_called(agent).idealised
+    if spread >= idealised.large_unit:
         yield (
-            f"V* less the value of uniform play is {spread:,.6g}: a PPO was worse than predicted by 0.16 in the mean "
-            f"where it was {LARGE_UNIT:g} or more, and the prediction does not depend on the unit of rewards; "
+            f"V* less the value of uniform play is {spread:,.6g}: the agent was worse than predicted by "
+            f"{idealised.large_unit_miss:g} in the mean where it was {idealised.large_unit:g} or more, and the prediction "
+            "does not depend on the unit of rewards; "
             "--scale-rewards range (in Python: scale_rewards='range') trains in a smaller one"
         )
 
