@@ -390,9 +390,9 @@ def _large_unit(agent: str, spread: float) -> Iterable[str]:
     if spread >= idealised.large_unit:
         yield (
             f"V* less the value of uniform play is {spread:,.6g}: the agent was worse than predicted by "
-            f"{idealised.large_unit_miss:g} in the mean where it was {idealised.large_unit:g} or more, and the prediction "
-            "does not depend on the unit of rewards; "
-            "--scale-rewards range (in Python: scale_rewards='range') trains in a smaller one"
+            f"{idealised.large_unit_miss:g} in the mean where it was {idealised.large_unit:g} or more, and the "
+            "prediction does not depend on the unit of rewards; --scale-rewards range (in Python: "
+            "scale_rewards='range') trains in a smaller one"
         )
 
 
