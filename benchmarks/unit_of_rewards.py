@@ -1,11 +1,13 @@
 """Which part of a DQN reacts to the unit of rewards: runs with its loss and its optimizer exchanged.
 
-    python benchmarks/unit_of_rewards.py
+    python benchmarks/unit_of_rewards.py [--predict]
 
 Prints for worlds of docs/studies/sealed-2, agents and numbers that rewards are divided by the regret of three seeds and
-the deviation of a seed: the table of docs/evidence/sealed-2.md. Ten minutes of a processor.
+the deviation of a seed: the table of docs/evidence/sealed-2.md. Ten minutes of a processor. With --predict it trains
+nothing and prints what `pharos predict` says of the agent in each unit: the table of docs/evidence/sealed-3.md.
 """
 
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from numba import njit
 
 from pharos import study, train_many
 from pharos.kernels import batched as kernels
+from pharos.prediction.learners import primary_regret
 from pharos.training import RunConfig
 
 STUDY = Path(__file__).parents[1] / "docs" / "studies" / "sealed-2" / "report.yaml"
@@ -57,12 +60,27 @@ AGENTS = {
 }
 
 
+def predicted(config, unit):
+    """What is predicted of a run if rewards are divided by `unit`."""
+    config = {**config, "chance": {**config["chance"], "scale_rewards": float(unit)}}
+    return primary_regret(config, RunConfig.from_dict(config).task(trust=True)).value
+
+
 def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--predict", action="store_true")
+    is_predicted = parser.parse_args().predict
     runs = [run for run in study.specification(STUDY, trust=True).runs if run.config["agent"] == "dqn"]
     for (world, observation), units in WORLDS.items():
         cells = (run for run in runs if world in run.cell["instance"] and run.cell["observation"] == observation)
         config = next(cells).config
         task = RunConfig.from_dict(config).task(trust=True)
+        if is_predicted:
+            said = ", ".join(f"{predicted(config, unit):.2f}" for unit in units)
+            print(
+                f"{world}), {observation}: divided by {', '.join(f'{unit:.3g}' for unit in units)}: {said}", flush=True
+            )
+            continue
         for agent, (loss, optimizer) in AGENTS.items():
             kernels.huber, kernels.adam = loss, optimizer
             for unit in units if agent == "Huber loss, Adam" else units[:2]:
