@@ -21,6 +21,7 @@ from pharos.training import RunConfig
 
 STUDIES = Path(__file__).parents[1] / "docs" / "studies"
 FILES = {"sealed-2": "report.yaml", "sealed-3": "study.yaml"}
+DIVIDED = "rewards divided by V* - U"
 KINDS = {
     "as published": {},
     "learning rate x 3": {"learning_rate": 0.0015},
@@ -29,9 +30,8 @@ KINDS = {
     "no entropy bonus": {"ent_coef": 0.0},
     "16 epochs": {"n_epochs": 16},
     "learning rate x 3, 16 epochs": {"learning_rate": 0.0015, "n_epochs": 16},
-    "rewards divided by V* - U": {},
+    DIVIDED: {},
 }
-DIVIDED = "rewards divided by V* - U"
 STEPS = np.arange(0, 30_001, 1000)
 SHOWN = 2000, 4000, 8000, 16_000, 30_000
 HALF = 0.5

@@ -349,6 +349,14 @@ def test_a_scale_of_rewards_is_another_unit_of_them_and_noise_is_not_divided(of)
             Sampling(reward_scale=scale)
 
 
+@pytest.mark.parametrize("spoilt", [lambda k: k * np.nan, lambda k: k * np.inf, lambda k: -k, lambda k: k[:, :-1]])
+def test_a_covariance_that_is_none_is_refused(spoilt):
+    kernel = np.asarray(kernel_of(7), np.float64)
+    seen = Representation.of_matrix(kernel, covariance=lambda rows, columns: spoilt(kernel[np.ix_(rows, columns)]))
+    with pytest.raises(ParameterError, match=r"covariance has shape .*; expected finite numbers of shape"):
+        huber_regret(random_mdp(7, 1), seen, schedule=SHORT)
+
+
 def test_without_the_covariance_of_outputs_it_is_undefined():
     with pytest.raises(UndefinedMeasure, match="huber_regret needs the covariance of the network's outputs"):
         huber_regret(random_mdp(7, 1), Representation.of_matrix(np.eye(7)), schedule=SHORT)

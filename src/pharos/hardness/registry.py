@@ -449,7 +449,7 @@ register(
     "sampled_regret",
     lambda problem: _represented(sampled_regret, problem, "solution", "sampling"),
     definition="mean over learning of (V* - V of the greedy policy) / (V* - V of uniform play) of Q-learning from "
-    "drawn transitions in the tangent kernel of the agent's network and in its root; and that of a table",
+    "drawn transitions in the tangent kernel of the agent's network and in its root. And the same of a table",
     source="pharos; after Mnih et al. (2015)",
     **_REPRESENTATION,
 )
@@ -458,7 +458,7 @@ register(
     lambda problem: _represented(huber_regret, problem, "solution", "sampling"),
     definition="mean over learning of (V* - V of the greedy policy) / (V* - V of uniform play) of Q-learning from "
     "drawn transitions in the tangent kernel of the agent's network and in its root, with the Huber loss and from a "
-    "random network; and that of a table",
+    "random network. And the same of a table",
     source="pharos; after Huber (1964), Mnih et al. (2015), Lee et al. (2018)",
     **_REPRESENTATION,
 )

@@ -37,7 +37,7 @@ class Representation:
         landmarks: of the approximation beyond MOST_WITHOUT_LANDMARKS different observations. 0 means none, whatever it
             takes. 2 or more are used for all sizes.
         conventions: what it is, JSON-able.
-        covariance: as `kernel`, the covariance of an output of the network before training; None: not known.
+        covariance: as `kernel`, the covariance of an output of the network before training. None if it is not known.
     """
 
     kernel: Callable[[np.ndarray, np.ndarray], np.ndarray]

@@ -166,8 +166,8 @@ def tangent_kernel(
     """The tangent kernel (N, M) float32 of a network on inputs x (N, ...), y (M, ...) as `network_inputs` gives them.
 
     Args:
-        of_outputs: return the covariance of an output of the random network in its place, the q of the output above:
-            the outputs of wide networks before training are a Gaussian process (Neal, 1996; Lee et al., 2018).
+        of_outputs: return the covariance of an output of the random network instead, q of the last layer. Outputs of
+            wide networks before training are a Gaussian process (Neal, 1996, Lee et al., 2018).
     Raises:
         ParameterError: the network has convolutions and the inputs are no images, or these are too small.
     """

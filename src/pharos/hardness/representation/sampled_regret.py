@@ -375,7 +375,7 @@ def huber_regret(
         A SampledRegret.
     Raises:
         UndefinedMeasure: the representation does not have that covariance, or as for `sampled_regret`.
-        ParameterError: as for `sampled_regret`.
+        ParameterError: the covariance is no finite matrix, or a variance is below 0, or as for `sampled_regret`.
     Cost: as for `sampled_regret`, and C^3 once more for the draw.
     Source: pharos, with the loss as in Huber (1964) and Mnih et al. (2015), and the process as in Lee et al. (2018).
     """
@@ -399,9 +399,20 @@ class HuberLearner(SampledLearner):
                 f"{self.measure} needs the covariance of the network's outputs, which this representation does not "
                 "have: take a network with a closed form, such as mlp128x2"
             )
+
+        def checked(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+            found = np.asarray(covariance(rows, columns))
+            is_matrix = found.shape == (len(rows), len(columns)) and bool(np.isfinite(found).all())
+            if not is_matrix or (rows is columns and bool((np.diag(found) < 0).any())):
+                raise ParameterError(
+                    f"covariance has shape {found.shape}; expected finite numbers of shape {len(rows), len(columns)}, "
+                    "and none below 0 of an observation with itself"
+                )
+            return found
+
         if len(observed) <= MOST_WITHOUT_LANDMARKS:
-            return Landmarks(covariance, observed, observed)
-        return Landmarks(covariance, observed, observed[drawn_indices(self.weights, DEFAULT_LANDMARKS)])
+            return Landmarks(checked, observed, observed)
+        return Landmarks(checked, observed, observed[drawn_indices(self.weights, DEFAULT_LANDMARKS)])
 
     def start(self, observations: Grouped, seed: int) -> np.ndarray:
         """A draw of the process. A table begins at zeros."""
