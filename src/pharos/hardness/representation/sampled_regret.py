@@ -401,14 +401,14 @@ class HuberLearner(SampledLearner):
             )
 
         def checked(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-            found = np.asarray(covariance(rows, columns))
-            is_matrix = found.shape == (len(rows), len(columns)) and bool(np.isfinite(found).all())
-            if not is_matrix or (rows is columns and bool((np.diag(found) < 0).any())):
+            block = np.asarray(covariance(rows, columns))
+            is_matrix = block.shape == (len(rows), len(columns)) and bool(np.isfinite(block).all())
+            if not is_matrix or (rows is columns and bool((np.diag(block) < 0).any())):
                 raise ParameterError(
-                    f"covariance has shape {found.shape}; expected finite numbers of shape {len(rows), len(columns)}, "
+                    f"covariance has shape {block.shape}; expected finite numbers of shape {len(rows), len(columns)}, "
                     "and none below 0 of an observation with itself"
                 )
-            return found
+            return block
 
         if len(observed) <= MOST_WITHOUT_LANDMARKS:
             return Landmarks(checked, observed, observed)
