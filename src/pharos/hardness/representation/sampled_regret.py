@@ -397,7 +397,7 @@ class HuberLearner(SampledLearner):
         if covariance is None:
             raise UndefinedMeasure(
                 f"{self.measure} needs the covariance of the network's outputs, which this representation does not "
-                "have: take a network with a closed form, such as mlp128x2"
+                "have: give it as `covariance`, or take a representation of pharos.observations"
             )
 
         def checked(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
