@@ -141,6 +141,13 @@ def batched(results):
             ),
         )
     name, each = "freeway/16x7-speed1", 6_000
+    seen = {"observation": "simple_image", "steps": 3_000, "evaluation_interval": 3_000, "seeds": range(4)}
+    given = {"learning_starts": 200}
+    timed(
+        results,
+        f"batched dqn, simple_image, {name}",
+        lambda: pharos.train_many("dqn", name, hyperparameters=given, **seen),
+    )
     setting = {"sticky": 0.25, "steps": 2 * each, "evaluation_interval": each, "seeds": range(8)}
     pharos.train_many("dqn", name, **setting | {"steps": 500, "evaluation_interval": 500, "seeds": range(2)})
     timed(

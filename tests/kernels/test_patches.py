@@ -72,7 +72,8 @@ def test_answers_and_gradients_are_those_of_a_convolution(seed, shape, number, c
 def test_keys_are_equal_where_patches_are(seed, shape, colours):
     pictures = pictures_of(np.random.default_rng(seed), shape, 6, colours)
     keys = np.empty((shape[1] * shape[2], 6), np.int64)
-    patch_keys(pictures.reshape(6, -1), shape, keys)
+    palette = np.full((COLOURS + 1, shape[0]), np.nan, np.float32)
+    count = patch_keys(pictures.reshape(6, -1), shape, keys, palette)
     padded = np.pad(pictures, ((0, 0), (0, 0), (1, 1), (1, 1)), constant_values=-1)  # outside is no colour
     names = {}
     for p in range(len(keys)):
@@ -81,13 +82,35 @@ def test_keys_are_equal_where_patches_are(seed, shape, colours):
             names.setdefault(padded[b, :, y : y + 3, x : x + 3].tobytes(), set()).add(keys[p, b])
     assert all(len(found) == 1 for found in names.values())
     assert len(set.union(*names.values())) == len(names)
+    # a key names the nine colours: from left to right, from top to bottom, 0 outside
+    assert count == len(np.unique(np.moveaxis(pictures, 1, -1).reshape(-1, shape[0]), axis=0))
+    padded = np.pad(pictures, ((0, 0), (0, 0), (1, 1), (1, 1)))
+    for p in range(len(keys)):
+        y, x = divmod(p, shape[2])
+        patches = padded[:, :, y : y + 3, x : x + 3].reshape(6, shape[0], 9)
+        for place in range(9):
+            assert np.array_equal(palette[keys[p] >> 7 * place & 127], patches[:, :, place])
 
 
 def test_where_colours_are_too_many_no_two_patches_are_one_group():
     noise = np.arange(2 * (COLOURS + 1), dtype=np.float32).reshape(2, -1)
     noise[1, :] = noise[0, :]
-    keys = np.empty((COLOURS + 1, 2), np.int64)
-    patch_keys(noise, (1, 1, COLOURS + 1), keys)
+    keys, palette = np.empty((COLOURS + 1, 2), np.int64), np.empty((COLOURS + 1, 1), np.float32)
+    assert patch_keys(noise, (1, 1, COLOURS + 1), keys, palette) == -1
     assert len(np.unique(keys)) == keys.size
-    patch_keys(noise[:, :COLOURS].copy(), (1, 1, COLOURS), keys[:COLOURS])
+    assert patch_keys(noise[:, :COLOURS].copy(), (1, 1, COLOURS), keys[:COLOURS], palette) == COLOURS
     assert np.array_equal(keys[:COLOURS, 0], keys[:COLOURS, 1])
+
+
+@settings(max_examples=30)
+@given(seed=st.integers(0, 2**32 - 1), channels=st.integers(1, 4))
+def test_a_picture_beside_too_many_colours_is_answered_by_the_same_bits(seed, channels):
+    rng, parameters, shape = np.random.default_rng(seed), Parameters(), (channels, 6, 6)
+    layer = PictureLayers(parameters, "net", shape)
+    values = parameters.views(torch.from_numpy(rng.standard_normal((1, parameters.length)).astype(np.float32)))
+    many, one = aligned_zeros(1, 8, layer.inputs), aligned_zeros(1, 1, layer.inputs)
+    many[0] = torch.from_numpy(rng.integers(0, 256, (8, layer.inputs)).astype(np.float32))
+    one[0, 0] = many[0, 0] = torch.from_numpy(pictures_of(rng, shape, 1, 5).reshape(-1))
+    keys, palette = np.empty((36, 8), np.int64), np.empty((COLOURS + 1, channels), np.float32)
+    assert patch_keys(many[0].numpy(), shape, keys, palette) == -1
+    assert np.array_equal(layer.forward(values, many).numpy()[0, 0], layer.forward(values, one).numpy()[0, 0])

@@ -7,7 +7,9 @@ p, and the two layers and their gradients are computed once for each group g, no
     h_g = max(0, patch_g K + k),   z_b = c + sum_p W_p h_g(b, p),   dz_g = sum of dz_b over b in g
     dW_p = sum_g h_g dz_g,   dh_g = W_p' dz_g if h_g > 0,   dK = sum_g patch_g dh_g
 
-A patch that is met at several pixels is convolved once. It is the same sum in another order, not an approximation.
+A patch that is met at several pixels is convolved once, as the sum of what each of its nine colours gives at its place.
+There are few colours, so K is applied to each of them once a place. It is the same sum in another order, not an
+approximation.
 
 Cost: with G groups at all pixels together 3 * 16 G outputs multiplications, in place of 3 * 16 B pixels outputs.
 """
@@ -18,6 +20,8 @@ from numba import float32, uint64
 from pharos.kernels.kernel_cache import kernel
 
 FILTERS = 16
+PLACES = 9  # pixels of a patch
+BITS = 7  # of a key, for the colour at one place
 COLOURS = 127  # that fit into seven bits, beside what is outside
 RECENT = 1024  # entries for patches that have been convolved
 SCATTER = 0x9E3779B97F4A7C15
@@ -33,13 +37,15 @@ def _is_alike(one, pixel, other, at, channels, pixels):
 
 
 @kernel
-def patch_keys(pictures, shape, keys):
+def patch_keys(pictures, shape, keys, colours):
     """keys (pixels, B) int64: equal if patches are. pictures (B, C pixels), shape (C, H, W).
 
-    Seven bits for the number of each of nine colours. If there are more than COLOURS of them all keys differ.
+    Seven bits for the number of each of nine colours. colours (COLOURS + 1, C): written, 0 for what is outside.
+    Return how many there are, or -1 if they are more than COLOURS. Then all keys differ.
     """
     channels, height, width = shape
     pixels, count = height * width, 0
+    colours[0] = 0.0
     origin = np.empty((COLOURS + 1, 2), np.int64)  # (picture, pixel) of each colour, by its number
     codes, rows = np.zeros((height + 2, width + 2), np.int64), np.empty((height + 2, width), np.int64)
     for b in range(len(pictures)):
@@ -55,16 +61,19 @@ def patch_keys(pictures, shape, keys):
                         code += 1
                     if code > COLOURS:
                         keys[:] = np.arange(keys.size).reshape(keys.shape)
-                        return
+                        return -1
                     if code > count:
                         count, origin[code, 0], origin[code, 1] = code, b, pixel
+                        for c in range(channels):
+                            colours[code, c] = picture[c * pixels + pixel]
                 codes[y + 1, x + 1] = code
         for y in range(height + 2):
             for x in range(width):
-                rows[y, x] = codes[y, x] | codes[y, x + 1] << 7 | codes[y, x + 2] << 14
+                rows[y, x] = codes[y, x] | codes[y, x + 1] << BITS | codes[y, x + 2] << 2 * BITS
         for y in range(height):
             for x in range(width):
-                keys[y * width + x, b] = rows[y, x] | rows[y + 1, x] << 21 | rows[y + 2, x] << 42
+                keys[y * width + x, b] = rows[y, x] | rows[y + 1, x] << 3 * BITS | rows[y + 2, x] << 6 * BITS
+    return count
 
 
 @kernel
@@ -91,16 +100,56 @@ def _grouped(keys, members, samples, slots):
 
 
 @kernel(fastmath={"contract"})
-def _convolve(picture, neighbours, kernel, bias, hidden):
-    """hidden (16,) = max(0, patch K + k). neighbours (9 C,): of a pixel in the picture, beyond its end if none."""
+def _apply(kernel, colours, count, table):
+    """table (9, COLOURS + 1, 16): K (9 C, 16) at each place of a patch times no colour and the first `count` ones."""
+    for place in range(PLACES):
+        for code in range(count + 1):
+            row = table[place, code]
+            row[:] = 0.0
+            for c in range(colours.shape[1]):
+                value = colours[code, c]
+                if value != 0.0:
+                    weights = kernel[c * PLACES + place]
+                    for f in range(FILTERS):
+                        row[f] += value * weights[f]
+
+
+@kernel
+def _code(key, place):
+    """The number of the colour at a place of a patch. key: uint64."""
+    return key >> uint64(BITS * place) & uint64(COLOURS)
+
+
+@kernel
+def _convolve_colours(key, table, bias, hidden):
+    """hidden (16,) = max(0, patch K + k) of a patch by its key. table: of `_apply`."""
+    codes = uint64(key)
+    t0, t1, t2 = table[0, _code(codes, 0)], table[1, _code(codes, 1)], table[2, _code(codes, 2)]
+    t3, t4, t5 = table[3, _code(codes, 3)], table[4, _code(codes, 4)], table[5, _code(codes, 5)]
+    t6, t7, t8 = table[6, _code(codes, 6)], table[7, _code(codes, 7)], table[8, _code(codes, 8)]
+    for f in range(FILTERS):
+        total = bias[f] + t0[f] + t1[f] + t2[f] + t3[f] + t4[f] + t5[f] + t6[f] + t7[f] + t8[f]
+        hidden[f] = max(total, float32(0.0))
+
+
+@kernel(fastmath={"contract"})
+def _convolve(picture, neighbours, kernel, bias, part, hidden):
+    """The same bits, of a patch by the indices (9 C,) of its neighbours in the picture, beyond its end if none.
+
+    part (16,): what one place gives.
+    """
     for f in range(FILTERS):
         hidden[f] = bias[f]
-    for k in range(len(neighbours)):
-        value = picture[neighbours[k]] if neighbours[k] < len(picture) else float32(0.0)
-        if value != 0.0:
-            row = kernel[k]
-            for f in range(FILTERS):
-                hidden[f] += value * row[f]
+    for place in range(PLACES):
+        part[:] = 0.0
+        for k in range(place, len(neighbours), PLACES):
+            value = picture[neighbours[k]] if neighbours[k] < len(picture) else float32(0.0)
+            if value != 0.0:
+                row = kernel[k]
+                for f in range(FILTERS):
+                    part[f] += value * row[f]
+        for f in range(FILTERS):
+            hidden[f] += part[f]
     for f in range(FILTERS):
         hidden[f] = max(hidden[f], float32(0.0))
 
@@ -135,7 +184,7 @@ def _combine(factors, rows, at, count, out):
 def _spread(products, members, total):
     """Add products (G, outputs) of groups to total (B, outputs) of their members (B,)."""
     for b in range(len(members)):
-        row, target = products[members[b]], total[b]
+        row, target = products[uint64(members[b])], total[b]
         for j in range(len(row)):
             target[j] += row[j]
 
@@ -145,7 +194,7 @@ def _sum_members(dy, members, dz):
     """dz (G, outputs) = the sum of dy (B, outputs) over the members of each group."""
     dz[:] = 0.0
     for b in range(len(members)):
-        row, target = dy[b], dz[members[b]]
+        row, target = dy[b], dz[uint64(members[b])]
         for j in range(len(row)):
             target[j] += row[j]
 
@@ -164,23 +213,26 @@ def forward(parameters, offsets, shape, indices, x, y, memory):
 
     offsets: of kernel, its bias, weight and its bias in a row. shape: (C, H, W). indices (pixels, 9 C): of neighbours
     in a picture. x (W, pitch): B pictures of C H W numbers from 0 to 255 each, one after another.
-    memory, written for `backward`: (begins (W, pixels + 1), the first group of each pixel; samples, owners (W, B
-    pixels), a picture of each group and the group whose patch is the same; hidden (W, B pixels, 16); members (W,
-    pixels, B), the group of each picture, counted from the pixel's first).
+    memory, written for `backward`: (begins (W, pixels + 1), the first group of each pixel; samples, owners, codes (W, B
+    pixels), a picture of each group, the group whose patch is the same, and the key; hidden (W, B pixels, 16);
+    members (W, pixels, B), the group of each picture, counted from the pixel's first; counts (W,) and colours (W,
+    COLOURS + 1, C) of `patch_keys`).
     """
-    begins, samples, owners, hidden, members = memory
+    begins, samples, owners, codes, hidden, members, counts, colours = memory
     number, pixels, outputs, size = y.shape[1], len(indices), y.shape[2], shape[0] * len(indices)
     keys, products = np.empty((pixels, number), np.int64), np.empty((number, outputs), np.float32)
     room = 2
     while room < 2 * number:
         room *= 2
     slots = np.empty(room, np.int64), np.full(room, -1, np.int64), np.empty(number, np.int64)
-    recent_keys, recent, live = np.empty(RECENT, np.int64), np.empty(RECENT, np.int64), np.empty(FILTERS, np.int64)
+    recent_keys, recent, live = np.empty(RECENT, np.int64), np.empty(RECENT, np.int64), np.empty(FILTERS, np.uint64)
+    table, part = np.empty((PLACES, COLOURS + 1, FILTERS), np.float32), np.empty(FILTERS, np.float32)
     for i in range(len(parameters)):
         pictures, total = x[i, : number * size].reshape(number, size), y[i]
         kernel, of_kernel, weight, bias = _parts(parameters[i], offsets, indices.shape[1], pixels, outputs)
         kernel = kernel * float32(1 / 255)
-        patch_keys(pictures, shape, keys)
+        counts[i] = patch_keys(pictures, shape, keys, colours[i])
+        _apply(kernel, colours[i], counts[i], table)
         total[:], recent[:] = bias, -1
         first = 0
         for p in range(pixels):
@@ -194,8 +246,11 @@ def forward(parameters, offsets, shape, indices, x, y, memory):
                     hidden[i, g] = hidden[i, recent[slot]]
                 else:
                     owners[i, g] = recent[slot] = g
-                    recent_keys[slot] = key
-                    _convolve(pictures[samples[i, g]], indices[p], kernel, of_kernel, hidden[i, g])
+                    recent_keys[slot], codes[i, g] = key, key
+                    if counts[i] < 0:
+                        _convolve(pictures[samples[i, g]], indices[p], kernel, of_kernel, part, hidden[i, g])
+                    else:
+                        _convolve_colours(key, table, of_kernel, hidden[i, g])
             w = weight[p * FILTERS : (p + 1) * FILTERS]
             for g in range(first, end):
                 _combine(hidden[i, g], w, live, _live(hidden[i, g], live), products[g - first])
@@ -235,15 +290,36 @@ def _add_patch(picture, neighbours, dh, of_kernel):
 
 
 @kernel
+def _add_to_colours(key, dh, table):
+    """Add dh (16,) of a patch to the gradient of the table of `_apply`, by its key."""
+    for place in range(PLACES):
+        row = table[place, _code(uint64(key), place)]
+        for f in range(FILTERS):
+            row[f] += dh[f]
+
+
+@kernel(fastmath={"contract"})
+def _add_colours(table, colours, count, of_kernel):
+    """Add to the gradient of the kernel (9 C, 16) what the gradient of the table of `_apply` gives."""
+    for place in range(PLACES):
+        for code in range(1, count + 1):
+            for c in range(colours.shape[1]):
+                value, row = colours[code, c], of_kernel[c * PLACES + place]
+                if value != 0.0:
+                    for f in range(FILTERS):
+                        row[f] += value * table[place, code, f]
+
+
+@kernel
 def backward(parameters, gradients, offsets, shape, indices, x, dy, memory):
     """Write the gradients (W, P) of the four parameters. dy (W, B, outputs): of z, before the activation.
 
     Everything else as `forward` has it.
     """
-    begins, samples, owners, hidden, members = memory
+    begins, samples, owners, codes, hidden, members, counts, colours = memory
     number, pixels, outputs, size = dy.shape[1], len(indices), dy.shape[2], shape[0] * len(indices)
     dz, dh = np.empty((number, outputs), np.float32), np.empty((number * pixels, FILTERS), np.float32)
-    live = np.empty(max(number, FILTERS), np.int64)
+    live, table = np.empty(max(number, FILTERS), np.uint64), np.empty((PLACES, COLOURS + 1, FILTERS), np.float32)
     for i in range(len(parameters)):
         pictures = x[i, : number * size].reshape(number, size)
         weight = _parts(parameters[i], offsets, indices.shape[1], pixels, outputs)[2]
@@ -263,12 +339,17 @@ def backward(parameters, gradients, offsets, shape, indices, x, dy, memory):
                 _dots(w, dz_of[g - first], live, _live(h[g - first], live), dh[g])
                 if owners[i, g] != g:
                     dh[owners[i, g]] += dh[g]
+        table[:, : counts[i] + 1] = 0.0
         for p in range(pixels):
             for g in range(begins[i, p], begins[i, p + 1]):
                 if owners[i, g] == g:
                     for f in range(FILTERS):
                         of_its_bias[f] += dh[g, f]
-                    _add_patch(pictures[samples[i, g]], indices[p], dh[g], of_kernel)
+                    if counts[i] < 0:
+                        _add_patch(pictures[samples[i, g]], indices[p], dh[g], of_kernel)
+                    else:
+                        _add_to_colours(codes[i, g], dh[g], table)
+        _add_colours(table, colours[i], counts[i], of_kernel)
         for k in range(len(of_kernel)):
             for f in range(FILTERS):
                 of_kernel[k, f] *= float32(1 / 255)

@@ -340,8 +340,11 @@ class PictureLayers(NetworkLayer):
             self._memories[width, number] = (
                 np.zeros((width, pixels + 1), np.int64),
                 *(np.empty(groups, np.int32) for _ in range(2)),
+                np.empty(groups, np.int64),
                 np.empty((*groups, patches.FILTERS), np.float32),
                 np.empty((width, pixels, number), np.int32),
+                np.zeros(width, np.int64),
+                np.empty((width, patches.COLOURS + 1, self.shape[0]), np.float32),
             )
         memory, pictures = self._memories[width, number], flat_view(x).numpy()
         rows = values[ALL_PARAMETERS].numpy()[: self.number]
