@@ -20,8 +20,8 @@ from numba import float32, uint64
 from pharos.kernels.kernel_cache import kernel
 
 FILTERS = 16
-PLACES = 9  # pixels of a patch
-BITS = 7  # of a key, for the colour at one place
+PATCH_PLACES = 9  # pixels of a patch
+COLOUR_BITS = 7  # of a key, for the colour at one place
 COLOURS = 127  # that fit into seven bits, beside what is outside
 RECENT = 1024  # entries for patches that have been convolved
 SCATTER = 0x9E3779B97F4A7C15
@@ -69,10 +69,12 @@ def patch_keys(pictures, shape, keys, colours):
                 codes[y + 1, x + 1] = code
         for y in range(height + 2):
             for x in range(width):
-                rows[y, x] = codes[y, x] | codes[y, x + 1] << BITS | codes[y, x + 2] << 2 * BITS
+                rows[y, x] = codes[y, x] | codes[y, x + 1] << COLOUR_BITS | codes[y, x + 2] << 2 * COLOUR_BITS
         for y in range(height):
             for x in range(width):
-                keys[y * width + x, b] = rows[y, x] | rows[y + 1, x] << 3 * BITS | rows[y + 2, x] << 6 * BITS
+                keys[y * width + x, b] = (
+                    rows[y, x] | rows[y + 1, x] << 3 * COLOUR_BITS | rows[y + 2, x] << 6 * COLOUR_BITS
+                )
     return count
 
 
@@ -102,14 +104,14 @@ def _grouped(keys, members, samples, slots):
 @kernel(fastmath={"contract"})
 def _apply(kernel, colours, count, table):
     """table (9, COLOURS + 1, 16): K (9 C, 16) at each place of a patch times no colour and the first `count` ones."""
-    for place in range(PLACES):
+    for place in range(PATCH_PLACES):
         for code in range(count + 1):
             row = table[place, code]
             row[:] = 0.0
             for c in range(colours.shape[1]):
                 value = colours[code, c]
                 if value != 0.0:
-                    weights = kernel[c * PLACES + place]
+                    weights = kernel[c * PATCH_PLACES + place]
                     for f in range(FILTERS):
                         row[f] += value * weights[f]
 
@@ -117,7 +119,7 @@ def _apply(kernel, colours, count, table):
 @kernel
 def _code(key, place):
     """The number of the colour at a place of a patch. key: uint64."""
-    return key >> uint64(BITS * place) & uint64(COLOURS)
+    return key >> uint64(COLOUR_BITS * place) & uint64(COLOURS)
 
 
 @kernel
@@ -140,9 +142,9 @@ def _convolve(picture, neighbours, kernel, bias, part, hidden):
     """
     for f in range(FILTERS):
         hidden[f] = bias[f]
-    for place in range(PLACES):
+    for place in range(PATCH_PLACES):
         part[:] = 0.0
-        for k in range(place, len(neighbours), PLACES):
+        for k in range(place, len(neighbours), PATCH_PLACES):
             value = picture[neighbours[k]] if neighbours[k] < len(picture) else float32(0.0)
             if value != 0.0:
                 row = kernel[k]
@@ -226,7 +228,7 @@ def forward(parameters, offsets, shape, indices, x, y, memory):
         room *= 2
     slots = np.empty(room, np.int64), np.full(room, -1, np.int64), np.empty(number, np.int64)
     recent_keys, recent, live = np.empty(RECENT, np.int64), np.empty(RECENT, np.int64), np.empty(FILTERS, np.uint64)
-    table, part = np.empty((PLACES, COLOURS + 1, FILTERS), np.float32), np.empty(FILTERS, np.float32)
+    table, part = np.empty((PATCH_PLACES, COLOURS + 1, FILTERS), np.float32), np.empty(FILTERS, np.float32)
     for i in range(len(parameters)):
         pictures, total = x[i, : number * size].reshape(number, size), y[i]
         kernel, of_kernel, weight, bias = _parts(parameters[i], offsets, indices.shape[1], pixels, outputs)
@@ -292,7 +294,7 @@ def _add_patch(picture, neighbours, dh, of_kernel):
 @kernel
 def _add_to_colours(key, dh, table):
     """Add dh (16,) of a patch to the gradient of the table of `_apply`, by its key."""
-    for place in range(PLACES):
+    for place in range(PATCH_PLACES):
         row = table[place, _code(uint64(key), place)]
         for f in range(FILTERS):
             row[f] += dh[f]
@@ -301,10 +303,10 @@ def _add_to_colours(key, dh, table):
 @kernel(fastmath={"contract"})
 def _add_colours(table, colours, count, of_kernel):
     """Add to the gradient of the kernel (9 C, 16) what the gradient of the table of `_apply` gives."""
-    for place in range(PLACES):
+    for place in range(PATCH_PLACES):
         for code in range(1, count + 1):
             for c in range(colours.shape[1]):
-                value, row = colours[code, c], of_kernel[c * PLACES + place]
+                value, row = colours[code, c], of_kernel[c * PATCH_PLACES + place]
                 if value != 0.0:
                     for f in range(FILTERS):
                         row[f] += value * table[place, code, f]
@@ -319,7 +321,7 @@ def backward(parameters, gradients, offsets, shape, indices, x, dy, memory):
     begins, samples, owners, codes, hidden, members, counts, colours = memory
     number, pixels, outputs, size = dy.shape[1], len(indices), dy.shape[2], shape[0] * len(indices)
     dz, dh = np.empty((number, outputs), np.float32), np.empty((number * pixels, FILTERS), np.float32)
-    live, table = np.empty(max(number, FILTERS), np.uint64), np.empty((PLACES, COLOURS + 1, FILTERS), np.float32)
+    live, table = np.empty(max(number, FILTERS), np.uint64), np.empty((PATCH_PLACES, COLOURS + 1, FILTERS), np.float32)
     for i in range(len(parameters)):
         pictures = x[i, : number * size].reshape(number, size)
         weight = _parts(parameters[i], offsets, indices.shape[1], pixels, outputs)[2]
