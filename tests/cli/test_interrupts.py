@@ -167,8 +167,8 @@ def test_an_interrupt_while_processes_start_is_raised_when_they_have(handler, fo
                 thread = threading.Thread(target=_take_an_interrupt)
                 thread.start()
                 thread.join()
-            else:
-                os.kill(os.getpid(), signal.SIGINT)
+            else:  # to the process, it would be taken by a thread that does not block it, some time later
+                signal.pthread_kill(threading.get_ident(), signal.SIGINT)
             assert signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
             steps.append("started")
         steps.append("not interrupted")
