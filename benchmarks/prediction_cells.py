@@ -3,6 +3,7 @@
     python benchmarks/prediction_cells.py compute --out cells.csv [--block NAME ...]
     python benchmarks/prediction_cells.py judge [--cells cells.csv] [--resamples 1000]
     python benchmarks/prediction_cells.py orders [--cells cells.csv]
+    python benchmarks/prediction_cells.py held [--cells cells.csv]
     python benchmarks/prediction_cells.py sealed [--resamples 1000]
     python benchmarks/prediction_cells.py collect
     python benchmarks/prediction_cells.py third [--cells cells.csv] [--resamples 1000]
@@ -17,8 +18,9 @@ not computed again. `judge` prints how well predictions agree with runs, by set 
 classes left out after a line, Spearman's rank correlation, the share of pairs of observations that are ordered rightly,
 R2 without a fit, half the width of the 80 % interval and the share of classes left out that it covers; in brackets 95 %
 intervals over classes drawn anew. Classes weigh alike. `orders` prints the pairs of observations by predicted
-difference. `sealed` prints the same of the second sealed test, by block and predictor, and what the interval of before
-it held. `collect` puts predictions and packed runs of the third one into its table of cells. `third` prints its result,
+difference. `held` prints by predicted regret what the interval held, and how wide one of these cells alone would be.
+`sealed` prints the same of the second sealed test, by block and predictor, and what the interval of before it held.
+`collect` puts predictions and packed runs of the third one into its table of cells. `third` prints its result,
 `huber_regret` beside `sampled_regret`, and what is missed by the unit of rewards. `pilots` prints how well a seed that
 is cut after a share of its steps predicts others in both last sets, with the measure and without. `draw` draws
 predicted against observed regret of the third sealed set. `cost` prints the seconds of a cell and the memory that it
@@ -41,7 +43,7 @@ import pandas as pd
 from pharos import study
 from pharos.agents import primary_predictors
 from pharos.prediction import Published
-from pharos.prediction.calibration import BINS, CELLS_FILE, NUMBER_COLUMNS
+from pharos.prediction.calibration import BINS, CELLS_FILE, NUMBER_COLUMNS, REGRET_BINS
 from pharos.prediction.learners import primary_regret
 from pharos.prediction.pilot import PILOT_SHARES as PILOTS
 from pharos.prediction.pilot import PILOTS_FILE
@@ -186,6 +188,22 @@ PREDICTORS = {
     "dqn": ("sampled_regret", "kernel_regret", "sampled_descent", "sampled_adam", "sampled_tabular"),
     "ppo": ("clipped_regret_evaluated", "policy_regret_evaluated", "kernel_regret", "clipped_tabular_regret"),
 }
+
+
+def held(file):
+    """By predicted regret: cells, the share that the interval held, and the half-width that would hold 0.8 of them."""
+    frame = pd.read_csv(file)
+    for agent in primary_predictors():
+        known = of(frame[frame["agent"] == agent])
+        near = [known.is_near(regret) for regret in REGRET_BINS]
+        shares = [known.coverage(near=regret) for regret in REGRET_BINS]
+        widths = [of(frame[frame["agent"] == agent][use]).half_width() for use in near]
+        for words, texts in (
+            ("cells", [f"{use.sum()}" for use in near]),
+            (f"held by ± {known.half_width():.2f}", [f"{share:.2f}" for share in shares]),
+            ("would have to be", [f"± {width:.2f}" for width in widths]),
+        ):
+            print(f"| {agent.upper()} | {words} | {' | '.join(texts)} |")
 
 
 def sealed(resamples):
@@ -484,7 +502,7 @@ def statistics(known, counts):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "task", choices=("compute", "judge", "orders", "sealed", "collect", "third", "pilots", "draw", "cost")
+        "task", choices=("compute", "judge", "orders", "held", "sealed", "collect", "third", "pilots", "draw", "cost")
     )
     parser.add_argument("--out", type=Path, default=CELLS_FILE)
     parser.add_argument("--cells", type=Path, default=CELLS_FILE)
@@ -499,6 +517,8 @@ def main():
         judge(arguments.cells, arguments.resamples)
     elif arguments.task == "orders":
         orders(arguments.cells)
+    elif arguments.task == "held":
+        held(arguments.cells)
     elif arguments.task == "sealed":
         sealed(arguments.resamples)
     elif arguments.task == "collect":

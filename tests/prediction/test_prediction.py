@@ -54,6 +54,21 @@ def test_half_widths_are_those_of_the_definition(seed):
         for name in sorted(set(classes))
     ]
     assert known.coverage(0.8) == pytest.approx(np.mean(inside), abs=1e-12)
+    for near, low, high in ((-0.3, -np.inf, 0.1), (0.1, 0.1, 0.2), (0.39, 0.2, 0.4), (0.5, 0.4, 0.8), (3.0, 0.8, 9.0)):
+        some = [
+            (name, error <= naive_half_width(known, 0.8, name))
+            for name, predicted, error in zip(
+                classes, known.predicted, np.abs(known.observed - known.predicted), strict=True
+            )
+            if low <= predicted < high
+        ]
+        shares = [np.mean([is_in for other, is_in in some if other == name]) for name in {name for name, _ in some}]
+        assert known.is_near(near).sum() == len(some)
+        assert known.coverage(0.8, near) == pytest.approx(np.mean(shares) if some else np.nan, abs=1e-12, nan_ok=True)
+
+
+def test_a_prediction_as_no_published_one_was_has_no_share():
+    assert np.isnan(cells([0.5, 0.6], [0.5, 0.6], ["a", "b"]).coverage(near=0.05))
 
 
 def test_a_class_that_is_drawn_as_the_others_is_covered():
@@ -190,6 +205,8 @@ def test_a_dqn_is_predicted_by_the_learner_with_its_loss_and_schedule():
         entry = cell.to_dict()
         assert (cell.lower, cell.upper) == (cell.low, cell.high) == (entry["lower"], entry["upper"])
         assert (entry["low"], entry["high"]) == (entry["lower"], entry["upper"])
+        assert (cell.local_coverage, cell.local_cells) == (entry["local_coverage"], entry["local_cells"])
+        assert cell.local_coverage == published("dqn").coverage(near=cell.value) and cell.local_cells > 70
     assert answer.half_width == published("dqn").half_width()
     assert [cell.observation for cell in answer.cells] == ["vector", "hash(bits=8)"]
     assert answer.predictor == "huber_regret" and answer.states == 5
@@ -331,6 +348,8 @@ def test_the_command_answers_in_json_and_in_words_and_draws(tmp_path):
     said = run(*words)
     assert said.exit_code == 0
     assert "0 is optimal, 1 is uniform play" in said.stdout and "80 % interval" in said.stdout
+    first = answer["cells"][0]
+    assert f"{first['local_coverage']:.2f} of {first['local_cells']}" in said.stdout
     assert any(word in said.stdout for word in ("is easier than", "too close to call"))
 
 

@@ -92,8 +92,9 @@ def test_the_pages_have_the_numbers_of_the_cells(cells, capsys):
         elif agent == "DQN" and name != "twelve of development":
             (row,) = (line for line in page.splitlines() if "`huber_regret`, named" in line)
             assert f"| {r_squared}" in row
-    for line in [*lines_of(capsys, cells.orders, cells.CELLS_FILE), *lines_of(capsys, cells.pilots, cells.CELLS_FILE)]:
-        assert line in page
+    for task in (cells.orders, cells.held, cells.pilots):
+        for line in lines_of(capsys, task, cells.CELLS_FILE):
+            assert line in page
     for text, lines in (
         (second, lines_of(capsys, cells.sealed, 1000)),
         (evidence, lines_of(capsys, cells.third, 1000)),

@@ -310,13 +310,14 @@ def _print_prediction(title: str, prediction: "Prediction", plot: Path | None) -
     print_table(
         f"{title}, {prediction.chance}: {prediction.states:,} states, "
         f"{prediction.agent.upper()} after {prediction.steps:,} steps",
-        ("observation", "network", ">predicted regret", ">80 % interval", ">with a table"),
+        ("observation", "network", ">predicted regret", ">80 % interval", ">held", ">with a table"),
         (
             (
                 cell.observation,
                 cell.network,
                 f"{cell.value:.2f}",
                 f"{cell.low:.2f} to {cell.high:.2f}",
+                f"{cell.local_coverage:.2f} of {cell.local_cells}" if cell.local_cells else "-",
                 f"{cell.tabular:.2f}",
             )
             for cell in prediction.cells
@@ -325,7 +326,8 @@ def _print_prediction(title: str, prediction: "Prediction", plot: Path | None) -
             *map(str, prediction.orders),
             f"0 is optimal, 1 is uniform play. By {prediction.predictor}; of {prediction.published_cells} published "
             f"cells of {prediction.published_classes} classes, such an interval held "
-            f"{100 * prediction.coverage:.0f} % where the class was left out.",
+            f"{100 * prediction.coverage:.0f} % where the class was left out. Held: the same of "
+            "cells predicted about as much (up to 0.1, 0.2, 0.4, 0.8, or more).",
             *(f"{name}: {value}" for name, value in facts),
         ],
     )

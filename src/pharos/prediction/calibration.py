@@ -5,6 +5,7 @@ benchmarks/prediction_cells.py makes it, and prints how well the predictions agr
 """
 
 import csv
+import math
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -19,6 +20,8 @@ CELLS_FILE = Path(__file__).parent / "data" / "cells.csv"
 BINS = (0.0, 0.05, 0.1, 0.2, 0.4)
 """Lower ends of the predicted differences that are counted together."""
 LEVEL = 0.8
+REGRET_BINS = (0.0, 0.1, 0.2, 0.4, 0.8)
+"""Lower ends of the predicted regrets that are counted together."""
 COMMON: dict[str, dict[str, object]] = {
     "dqn": {
         **{"learning_rate": 0.001, "buffer_size": 50000, "learning_starts": 1000, "batch_size": 32, "gamma": 0.95},
@@ -90,11 +93,25 @@ class Published:
         index = min(int(np.searchsorted(cumulative, aim - 1e-12)), len(errors) - 1)
         return float(errors[order][index])
 
-    def coverage(self, level: float = LEVEL) -> float:
-        """The share of cells within the interval of the other classes, a mean over classes that are left out."""
-        errors = np.abs(self.observed - self.predicted)
-        names = np.unique(self.classes)
-        return float(np.mean([np.mean(errors[self.classes == name] <= self.half_width(level, name)) for name in names]))
+    def coverage(self, level: float = LEVEL, near: float | None = None) -> float:
+        """The share of cells within the interval of the other classes, a mean over classes that are left out.
+
+        Args:
+            near: a predicted regret. Only cells count whose prediction lies in the same of REGRET_BINS. NaN if none do.
+        """
+        errors, use = np.abs(self.observed - self.predicted), self.is_near(near)
+        shares = []
+        for name in np.unique(self.classes[use]):
+            of_class = errors[use & (self.classes == name)]
+            shares.append(np.mean(of_class <= self.half_width(level, name)))
+        return float(np.mean(shares)) if shares else math.nan
+
+    def is_near(self, near: float | None) -> np.ndarray:
+        """(N,) bool: cells whose prediction lies in the same of REGRET_BINS as this regret. None: all."""
+        if near is None:
+            return np.ones(len(self.predicted), bool)
+        inner = REGRET_BINS[1:]  # whatever is below 0 lies in the first one
+        return np.searchsorted(inner, self.predicted, side="right") == np.searchsorted(inner, near, side="right")
 
     def ordered(self, difference: float) -> "OrderCounts":
         """Count the pairs of observations of one MDP whose predictions differ about as much, all of them."""

@@ -47,12 +47,16 @@ class PredictedRegret(PrimaryRegret):
         observation: what the agent sees, with its options.
         low, high: ends of the interval that covered LEVEL of the published cells, at least 0. Also `lower` and `upper`.
         pilot: mean regret of a pilot so far, NaN without one. `value` is then what it and the idealised learner say.
+        local_coverage, local_cells: share of the published cells predicted about as much (`REGRET_BINS`) that such
+            intervals held where their class was left out, and the number of these cells.
     """
 
     observation: str
     low: float
     high: float
     pilot: float = math.nan
+    local_coverage: float = math.nan
+    local_cells: int = 0
 
     @property
     def lower(self) -> float:
@@ -269,7 +273,17 @@ def predict(
                 so_far = pilot_regret(agent, task, steps, settings, pilot)
                 regret = replace(regret, value=joint.value(so_far, regret.value))
             low, high = max(0.0, regret.value - width), regret.value + width
-            cells.append(PredictedRegret(observation=title, low=low, high=high, pilot=so_far, **vars(regret)))
+            cells.append(
+                PredictedRegret(
+                    observation=title,
+                    low=low,
+                    high=high,
+                    pilot=so_far,
+                    local_coverage=covering.coverage(near=regret.value),
+                    local_cells=int(covering.is_near(regret.value).sum()),
+                    **vars(regret),
+                )
+            )
         if math.isnan(spread):  # in the unit that is paid
             spread = task.reference.spread() / task.scaled_chance.reward_scale
     if not cells:
