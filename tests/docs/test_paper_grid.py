@@ -54,3 +54,24 @@ def test_the_large_tables_are_those_of_the_packed_runs(words, monkeypatch):
         for text, value in zip(row[of_policies].split(", "), sorted(some["final_value"]), strict=True):
             check(text, value)
         check(row[of_regret], some["normalized_regret"].mean())
+
+
+@pytest.mark.long
+def test_images_under_chance_are_those_of_the_later_runs(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "scripts")
+    packed = importlib.import_module("article").packed
+    runs = {"simple_image": packed("paper/later-runs.parquet")[0], "vector": packed("paper/runs.parquet")[0]}
+    head, _, *lines = PAGE[PAGE.index("| instance | random 0.1, images") :].split("\n\n")[0].splitlines()
+    assert head == "| instance | random 0.1, images | vectors | sticky 0.25, images | vectors |"
+    columns = [(chance, observation) for chance in ("random 0.1", "sticky 0.25") for observation in runs]
+    number = 0
+    for line in lines:
+        instance, *texts = (cell.strip(" `") for cell in line.strip("|").split("|"))
+        for text, (chance, observation) in zip(texts, columns, strict=True):
+            cells = runs[observation].groupby(["agent", "observation", "instance", "chance"])
+            if text:
+                some = cells.get_group(("dqn", observation, instance, chance))
+                assert len(some) == 5
+                check(text, some["normalized_regret"].mean())
+                number += observation == "simple_image"
+    assert 5 * number == len(runs["simple_image"])  # nothing is left out
