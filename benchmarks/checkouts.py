@@ -141,7 +141,7 @@ def batched(results):
             ),
         )
     name, each = "freeway/16x7-speed1", 6_000
-    seen = {"observation": "simple_image", "steps": 3_000, "evaluation_interval": 3_000, "seeds": range(4)}
+    seen = {"observation": "simple_image", "steps": 3_000, "evaluation_interval": 3_000, "seeds": range(8)}
     given = {"learning_starts": 200}
     timed(
         results,

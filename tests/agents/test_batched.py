@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from batched_runs import difference, learned, outcome, runs_of
+from pharos.agents.agent import RunShape
 from pharos.agents.batched import group_key, make_batch, supports
 from pharos.agents.batched.arithmetic import TensorArithmetic
 from pharos.agents.batched.runs import lane_width, lane_widths
@@ -56,18 +57,44 @@ def test_a_run_is_the_same_alone_among_others_and_in_another_order(grid, agent):
 
 
 @pytest.mark.parametrize("agent", AGENTS)
+def test_a_checkpoint_of_other_lanes_goes_on_in_those(agent, monkeypatch):
+    """As one of an older pharos, whose lanes were wider."""
+    task = Task.of(make("simple_grid"), observation="simple_image")
+    runs, ended = runs_of(task, AGENTS[agent], 7), learned(agent, runs_of(task, AGENTS[agent], 7))
+    for width in (2, 8):
+        monkeypatch.setattr("pharos.agents.batched.runs.WIDTH_OF_SMALL_IMAGES", width)
+        older = make_batch(agent, runs)
+        older.learn([ended.steps // 2], lambda step: None)
+        monkeypatch.undo()
+        newer = make_batch(agent, runs)
+        assert [lane.group.width for lane in newer.lanes] == [4, 4]
+        newer.restore(older.state())
+        assert [lane.group.width for lane in newer.lanes] == {2: [2, 2, 2, 2], 8: [8]}[width]
+        newer.learn([ended.steps], lambda step: None)
+        assert all(outcome(newer, i) == outcome(ended, i) for i in range(7))
+
+
+@pytest.mark.parametrize("agent", AGENTS)
 @pytest.mark.parametrize("observation", ["vector", "simple_image"])
-def test_a_run_is_the_same_in_lanes_of_every_width(observation, agent):
+def test_a_run_is_the_same_in_lanes_of_every_width(observation, agent, monkeypatch):
     task = Task.of(make("simple_grid"), sticky=0.2, random=0.1, observation=observation)
     runs = runs_of(task, AGENTS[agent], 12)
     first = outcome(learned(agent, runs[:1]), 0)
     assert all(outcome(learned(agent, runs[:number]), 0) == first for number in (5, 7, 12))
+    for width in (2, 6, 12):
+        monkeypatch.setattr("pharos.agents.batched.runs.WIDTH_OF_SMALL_IMAGES", width)
+        assert outcome(learned(agent, runs), 0) == first
 
 
 def test_a_lane_has_at_most_three_idle_runs():
-    assert [lane_widths(number, False) for number in (1, 5, 10, 32, 37)] == [[4], [6], [10], [32], [32, 6]]
-    assert lane_widths(9, True) == [8, 4]
-    assert [lane_widths(number, False, "cuda") for number in (9, 33, 300)] == [[10], [34], [256, 44]]
+    vector, screen, lake, court = (
+        RunShape(shape, "uint8", len(shape) == 3, 1, 2, 9) for shape in ((5,), (84, 84, 3), (3, 8, 8), (3, 24, 8))
+    )
+    assert [lane_widths(number, vector) for number in (1, 5, 10, 32, 37)] == [[4], [6], [10], [32], [32, 6]]
+    assert [lane_widths(9, shape) for shape in (screen, lake, court)] == [[8, 4], [4, 4, 4], [2, 2, 2, 2, 2]]
+    assert [lane_widths(number, court) for number in (1, 3)] == [[2], [2, 2]]
+    assert [lane_widths(number, vector, "cuda") for number in (9, 33, 300)] == [[10], [34], [256, 44]]
+    assert lane_widths(9, court, "cuda") == [10]
     assert lane_width(True, "cuda") == 256
 
 

@@ -9,7 +9,7 @@ import torch
 from pharos.agents.agent import joined_states, learner_state
 from pharos.agents.batched.arithmetic import is_gpu
 from pharos.agents.batched.lane import RunPolicy
-from pharos.agents.batched.runs import BatchRun, group_key, lane_width, lane_widths
+from pharos.agents.batched.runs import BatchRun, group_key, lane_widths
 from pharos.errors import ParameterError
 
 
@@ -29,12 +29,16 @@ class Batch:
         if len(keys) > 1:
             raise ParameterError(f"{len(runs)} runs are of {len(keys)} groups; expected one batch a group (group_key)")
         self.runs = list(runs)
-        is_image = runs[0].observe.is_image
-        self.width = lane_width(is_image, device)  # of all lanes but the last
-        lane = importlib.import_module(f"pharos.agents.batched.{agent}").LANE
+        self._agent, self._device = agent, device
+        self._make_lanes(lane_widths(len(runs), runs[0].shape, device))
+
+    def _make_lanes(self, widths: Sequence[int]) -> None:
+        """Pack the runs into lanes of these widths."""
+        self.width = widths[0]  # of all lanes but the last
+        lane = importlib.import_module(f"pharos.agents.batched.{self._agent}").LANE
         self.lanes = [
-            lane(self.runs[i * self.width : (i + 1) * self.width], width, device)
-            for i, width in enumerate(lane_widths(len(runs), is_image, device))
+            lane(self.runs[i * self.width : (i + 1) * self.width], width, self._device)
+            for i, width in enumerate(widths)
         ]
 
     @property
@@ -93,7 +97,10 @@ class Batch:
         return joined_states({name: array.copy() for name, array in lane.arrays().items()} for lane in self.lanes)
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Restore a state that `state` returned, in a batch of the same runs."""
+        """Restore a state that `state` returned, in a batch of the same runs, in lanes of the widths that it has."""
+        widths = [len(array) for name, array in state.items() if name.endswith("/updates")]
+        if widths != [lane.group.width for lane in self.lanes]:
+            self._make_lanes(widths)
         for k, lane in enumerate(self.lanes):
             lane.restore(learner_state(state, k))
 

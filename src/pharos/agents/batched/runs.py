@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from pharos.observations import ObservationInContext
     from pharos.state_space import StateSpace
 
-WIDTH_OF_VECTORS, WIDTH_OF_IMAGES = 32, 8  # most runs of a lane
+WIDTH_OF_VECTORS, WIDTH_OF_IMAGES = 32, 8  # most runs of a lane, or of a batch of small images
+WIDTH_OF_SMALL_IMAGES, WIDTH_OF_WIDE_IMAGES = 4, 2  # most runs of a lane of these
+WIDE_IMAGE = 100  # pixels of a small image whose networks do not fit the second-level cache
 NARROWEST = 4
 WIDTH_ELSEWHERE = 256  # on other devices than the processor
 
@@ -277,17 +279,22 @@ def _is_in_steps(value: int | tuple[int, str]) -> bool:
 
 
 def lane_width(is_image: bool, device: str = "cpu") -> int:
-    """Maximum runs of a lane, chosen by measurement on the processor (docs/decisions/0013-batched-training.md)."""
+    """Most runs that one program trains, chosen by measurement on the processor
+    (docs/decisions/0013-batched-training.md).
+    """
     if device != "cpu":
         return WIDTH_ELSEWHERE
     return WIDTH_OF_IMAGES if is_image else WIDTH_OF_VECTORS
 
 
-def lane_widths(number: int, is_image: bool, device: str = "cpu") -> list[int]:
+def lane_widths(number: int, shape: RunShape, device: str = "cpu") -> list[int]:
     """The widths of the lanes of a batch: the last one has at most one idle run, or NARROWEST rows.
 
-    A width is even and at least NARROWEST, as the processor adds up products of single runs in another order.
+    A width is even, as the processor adds up products of single runs in another order.
     """
-    widest = lane_width(is_image, device)
+    widest = lane_width(shape.is_image, device)
+    picture = as_networks_see(shape.shape, shape.is_image)[0]
+    if device == "cpu" and is_small(picture, shape.is_image):
+        widest = WIDTH_OF_SMALL_IMAGES if math.prod(picture[1:]) < WIDE_IMAGE else WIDTH_OF_WIDE_IMAGES
     full, rest = divmod(number, widest)
-    return [widest] * full + ([max(rest + rest % 2, NARROWEST)] if rest else [])
+    return [widest] * full + ([max(rest + rest % 2, min(NARROWEST, widest))] if rest else [])
