@@ -72,7 +72,7 @@ class Scripted(VecEnvWrapper):
 
 def recorded(agent, task, hyperparameters, steps):
     """A lane that has taken its steps, without updates; and the environment in which Stable-Baselines3 takes them."""
-    (lane,) = make_batch(agent, runs_of(task, hyperparameters, steps=steps)).lanes
+    lane, *_ = make_batch(agent, runs_of(task, hyperparameters, steps=steps)).lanes
     script, flags, move = [], set(), lane.execute_actions
 
     def record():
