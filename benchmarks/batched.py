@@ -1,13 +1,15 @@
 """How fast is the batched engine beside Stable-Baselines3? Agent-steps per second of processor time of one thread.
 
     python benchmarks/batched.py [--instance NAME] [--rounds R] [--seconds S] [--agents dqn ppo] [--observations ...]
-                                 [--frames 1 4] [--grey]
+                                 [--frames 1 4] [--grey] [--lanes 8 4 2]
 
 Both with the hyperparameters of pharos' table, after `learning_starts` and some updates. Rounds go through all
 contestants in turn, so that a busy machine slows all alike; the ratio is the median over rounds. The last columns:
 arithmetic of the networks in GFLOP/s (of images as if each were computed by itself), and its share of what a plain
 product of matrices reached in the same round.
 With several numbers of frames, of images, all of them are contestants of the same rounds; the ratio is each one's own.
+With `--lanes` it compares these widths of lanes of small images instead, by milliseconds of a step of one run and the
+ratio to the first width, and says whether parameters have the same bits in the end.
 """
 
 import argparse
@@ -19,6 +21,7 @@ import torch
 
 from pharos.agents import hyperparameters, make_model
 from pharos.agents.batched import BatchRun, ObservationSource, make_batch
+from pharos.agents.batched import runs as batched_runs
 from pharos.interaction import make_sb3_vec
 from pharos.training import Task
 
@@ -53,7 +56,7 @@ class Alone:
 
 
 class Together:
-    """As many runs of the batched engine as make a lane."""
+    """As many runs of the batched engine as one program trains."""
 
     def __init__(self, agent: str, task: Task, options: dict, runs: int):
         source = ObservationSource.of(task.space, task.observer.observe)
@@ -99,8 +102,13 @@ def main() -> None:
     parser.add_argument("--observations", nargs="+", default=["vector", "simple_image"])
     parser.add_argument("--frames", type=int, nargs="+", default=[1], help="of images: how many are stacked")
     parser.add_argument("--grey", action="store_true", help="images of one plane for each frame")
+    parser.add_argument("--lanes", type=int, nargs="+", help="widths of lanes of small images")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
+    if arguments.lanes:
+        for agent in arguments.agents:
+            compare_lanes(agent, arguments.instance, arguments.lanes, arguments.rounds)
+        return
     print(f"{arguments.instance}, torch {torch.__version__}, {torch.backends.cpu.get_cpu_capability()}, one thread")
     print(f"{'':22}{'runs':>5}{'sb3/s':>9}{'batched/s':>11}{'ratio':>7}{'lowest':>8}{'GFLOP/s':>9}{'of peak':>9}")
     for agent in arguments.agents:
@@ -112,6 +120,35 @@ def main() -> None:
                     case.rounds.append((*(speed(each, arguments.seconds, case.unit) for each in case.pair), peak()))
             for case in cases:
                 print(case, flush=True)
+
+
+def compare_lanes(agent: str, instance: str, widths: list[int], rounds: int) -> None:
+    """Print what a step of one of eight runs takes in lanes of each width, in rounds in turn."""
+    task = Task.of(instance, observation="simple_image")
+    options = hyperparameters(agent, task.env.name, "simple_image")
+    if agent == "dqn":
+        options |= {"exploration_fraction": 1e-6, "learning_starts": 500}
+    unit = options["n_envs"] * options["n_steps"] if agent == "ppo" else 160
+    contestants, times = {}, {width: [] for width in widths}
+    for width in widths:
+        batched_runs.WIDTH_OF_SMALL_IMAGES = batched_runs.WIDTH_OF_WIDE_IMAGES = width
+        contestants[width] = Together(agent, task, options, 8)
+        contestants[width].learn(max(600, unit))
+    for _ in range(rounds):
+        for width, contestant in contestants.items():
+            began = time.process_time()
+            contestant.learn(unit)
+            times[width].append((time.process_time() - began) / unit / contestant.runs)
+    first = contestants[widths[0]].batch
+    for width, contestant in contestants.items():
+        ratio = statistics.median(a / b for a, b in zip(times[width], times[widths[0]], strict=True))
+        same = all(
+            (array == first.parameters(i)[name]).all()
+            for i in range(contestant.runs)
+            for name, array in contestant.batch.parameters(i).items()
+        )
+        milliseconds = 1e3 * statistics.median(times[width])
+        print(f"{agent} {instance} lanes of {width}: {milliseconds:.3f} ms, {ratio:.2f}, same bits: {same}", flush=True)
 
 
 class Case:

@@ -18,13 +18,14 @@ not computed again. `judge` prints how well predictions agree with runs, by set 
 classes left out after a line, Spearman's rank correlation, the share of pairs of observations that are ordered rightly,
 R2 without a fit, half the width of the 80 % interval and the share of classes left out that it covers; in brackets 95 %
 intervals over classes drawn anew. Classes weigh alike. `orders` prints the pairs of observations by predicted
-difference. `held` prints by predicted regret what the interval held, and how wide one of these cells alone would be.
-`sealed` prints the same of the second sealed test, by block and predictor, and what the interval of before it held.
-`collect` puts predictions and packed runs of the third one into its table of cells. `third` prints its result,
-`huber_regret` beside `sampled_regret`, and what is missed by the unit of rewards. `pilots` prints how well a seed that
-is cut after a share of its steps predicts others in both last sets, with the measure and without. `draw` draws
-predicted against observed regret of the third sealed set. `cost` prints the seconds of a cell and the memory that it
-adds, each in a process of its own that has compiled, by states of a grid, agent and observation.
+difference. `held` prints by predicted regret what the interval held, and how wide one of these cells alone would be,
+and of each sealed set what such widths hold. `sealed` prints the same of the second sealed test, by block and
+predictor, and what the interval of before it held. `collect` puts predictions and packed runs of the third one into its
+table of cells. `third` prints its result, `huber_regret` beside `sampled_regret`, and what is missed by the unit of
+rewards. `pilots` prints how well a seed that is cut after a share of its steps predicts others in both last sets, with
+the measure and without. `draw` draws predicted against observed regret of the third sealed set. `cost` prints the
+seconds of a cell and the memory that it adds, each in a process of its own that has compiled, by states of a grid,
+agent and observation.
 """
 
 import argparse
@@ -204,6 +205,23 @@ def held(file):
             ("would have to be", [f"± {width:.2f}" for width in widths]),
         ):
             print(f"| {agent.upper()} | {words} | {' | '.join(texts)} |")
+
+
+def widths_by_prediction(file):
+    """Of each sealed set: what intervals of the other sets' cells hold, whose width follows the prediction or not."""
+    frame = pd.read_csv(file)
+    for name in ("sealed-1", "sealed-2", "sealed-3"):
+        for agent in primary_predictors():
+            cells = frame[frame["agent"] == agent]
+            is_new = cells["study"] == name
+            known, new, width = of(cells[~is_new]), of(cells[is_new]), np.zeros(is_new.sum())
+            for regret in REGRET_BINS:
+                width[new.is_near(regret)] = of(cells[~is_new][known.is_near(regret)]).half_width()
+            table = pd.DataFrame({"class": new.classes, "width": width, "error": np.abs(new.observed - new.predicted)})
+            table["follows"], table["one"] = table["error"] <= width, table["error"] <= known.half_width()
+            of_all = table.groupby("class")[["follows", "one", "width"]].mean().mean()
+            ratio = of_all["width"] / known.half_width()
+            print(f"{name} {agent}: held {of_all['follows']:.2f} for {of_all['one']:.2f}, width {ratio:.2f} of it")
 
 
 def sealed(resamples):
@@ -519,6 +537,7 @@ def main():
         orders(arguments.cells)
     elif arguments.task == "held":
         held(arguments.cells)
+        widths_by_prediction(arguments.cells)
     elif arguments.task == "sealed":
         sealed(arguments.resamples)
     elif arguments.task == "collect":

@@ -74,6 +74,15 @@ def test_a_checkpoint_of_other_lanes_goes_on_in_those(agent, monkeypatch):
         assert all(outcome(newer, i) == outcome(ended, i) for i in range(7))
 
 
+@pytest.mark.parametrize("widths", [[], [7], [8, 2], [2, 6], [0, 8], [10**9], [4, 4, 4], [6, 2, 0]])
+def test_a_checkpoint_of_lanes_that_do_not_hold_its_runs_is_refused(widths):
+    batch = make_batch("dqn", runs_of(Task.of(make("simple_grid"), observation="simple_image"), DQN, 8))
+    state = {name: array for name, array in batch.state().items() if not name.endswith("/updates")}
+    state |= {f"{i}/updates": np.broadcast_to(np.int64(0), width) for i, width in enumerate(widths)}
+    with pytest.raises(ParameterError, match="expected lanes of 8 runs"):
+        batch.restore(state)
+
+
 @pytest.mark.parametrize("agent", AGENTS)
 @pytest.mark.parametrize("observation", ["vector", "simple_image"])
 def test_a_run_is_the_same_in_lanes_of_every_width(observation, agent, monkeypatch):

@@ -9,7 +9,7 @@ import torch
 from pharos.agents.agent import joined_states, learner_state
 from pharos.agents.batched.arithmetic import is_gpu
 from pharos.agents.batched.lane import RunPolicy
-from pharos.agents.batched.runs import BatchRun, group_key, lane_widths
+from pharos.agents.batched.runs import NARROWEST, BatchRun, group_key, lane_widths
 from pharos.errors import ParameterError
 
 
@@ -97,9 +97,16 @@ class Batch:
         return joined_states({name: array.copy() for name, array in lane.arrays().items()} for lane in self.lanes)
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Restore a state that `state` returned, in a batch of the same runs, in lanes of the widths that it has."""
+        """Restore a state that `state` returned, in a batch of the same runs, in lanes of the widths that it has.
+
+        Raises:
+            ParameterError: these are no lanes of so many runs.
+        """
         widths = [len(array) for name, array in state.items() if name.endswith("/updates")]
         if widths != [lane.group.width for lane in self.lanes]:
+            full, idle = set(widths[:-1]), sum(widths) - len(self.runs)
+            if not 0 <= idle < min(NARROWEST, *widths) or not full <= {max(widths)}:
+                raise ParameterError(f"the state has lanes of {widths} runs; expected lanes of {len(self.runs)} runs")
             self._make_lanes(widths)
         for k, lane in enumerate(self.lanes):
             lane.restore(learner_state(state, k))
