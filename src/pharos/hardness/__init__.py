@@ -33,7 +33,15 @@ from pharos.hardness.representation.kernel_regret import (
     kernel_regret,
     kernel_sample_complexity,
 )
-from pharos.hardness.representation.learning import LearningCurve, Representation, Rollouts, Schedule
+from pharos.hardness.representation.learning import (
+    Adam,
+    LearningCurve,
+    OutputLayer,
+    Representation,
+    Rollouts,
+    Schedule,
+)
+from pharos.hardness.representation.network_regret import NetworkRegret, network_policy_regret, network_regret
 from pharos.hardness.representation.sampled_regret import SampledRegret, Sampling, huber_regret, sampled_regret
 from pharos.hardness.steps import ReturnDistribution, return_distribution
 from pharos.hardness.value_norm import ActionGapRegularity, action_gap_regularity, environmental_value_norm
@@ -64,6 +72,7 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
+    "Adam",
     "Certified",
     "EffectiveHorizon",
     "Gaps",
@@ -93,6 +102,8 @@ __all__ = [
     "measures",
     "minimal_gap",
     "mixing_time",
+    "network_policy_regret",
+    "network_regret",
     "occupancy",
     "register",
     "report",

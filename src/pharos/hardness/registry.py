@@ -20,7 +20,8 @@ from pharos.hardness.representation.kernel_regret import (
     kernel_regret,
     kernel_sample_complexity,
 )
-from pharos.hardness.representation.learning import Representation, Rollouts, Schedule
+from pharos.hardness.representation.learning import Adam, Representation, Rollouts, Schedule
+from pharos.hardness.representation.network_regret import network_policy_regret, network_regret
 from pharos.hardness.representation.sampled_regret import Sampling, huber_regret, sampled_regret
 from pharos.hardness.value_norm import action_gap_regularity, certified_value_norm
 from pharos.hardness.visitation import covering, distribution_mismatch, exploration_time, mixing_time
@@ -44,6 +45,7 @@ class Problem:
         schedule: of the idealised learner.
         rollouts: of the idealised actor-critic. Default: the defaults of `Rollouts`.
         sampling: of the learner that draws. Default: the default of `Sampling`.
+        adam: of the learners that step as an agent does. Default: the default of `Adam`.
         folder: in which optimal values and bounds of searches are kept while they are computed. None: in memory.
         is_strict: whether the budget also ends measures without bounds to show for it, which are then not available.
         clock: of the running measure.
@@ -59,6 +61,7 @@ class Problem:
     schedule: Schedule = field(default_factory=Schedule)
     rollouts: Rollouts | None = None
     sampling: Sampling | None = None
+    adam: Adam | None = None
     folder: Path | None = None
     is_strict: bool = False
 
@@ -468,6 +471,23 @@ register(
     definition="mean over learning of (V* - V of the most probable actions) / (V* - V of uniform play) of an expected "
     "actor-critic in the tangent kernel of the agent's network; as played; and both of a table",
     source="pharos; Sutton et al. (2000), Schulman et al. (2016, 2017)",
+    **_REPRESENTATION,
+)
+register(
+    "network_regret",
+    lambda problem: _represented(network_regret, problem, "solution", "sampling", "adam"),
+    definition="mean over learning of (V* - V of the greedy policy) / (V* - V of uniform play) of a DQN in an "
+    "idealised network, whose output layer and layers beneath learn by the agent's own steps of Adam. And the same of "
+    "a table",
+    source="pharos; after Mnih et al. (2015), Kingma and Ba (2015), Jacot et al. (2018)",
+    **_REPRESENTATION,
+)
+register(
+    "network_policy_regret",
+    lambda problem: _represented(network_policy_regret, problem, "solution", "rollouts", "sampling", "adam"),
+    definition="mean over learning of (V* - V of the policy) / (V* - V of uniform play) of a PPO in two idealised "
+    "networks, whose output layers and layers beneath learn by the agent's own steps of Adam. And the same of a table",
+    source="pharos; after Schulman et al. (2016, 2017), Kingma and Ba (2015), Jacot et al. (2018)",
     **_REPRESENTATION,
 )
 register(

@@ -19,7 +19,7 @@ import xxhash
 from pharos.errors import MeasureUnfinished, PrecisionError, UndefinedMeasure
 from pharos.hardness.interval import Budget, Certificate, Certified, certificate_of, finite
 from pharos.hardness.registry import Measure, Problem, selected_measures
-from pharos.hardness.representation.learning import Representation, Rollouts, Schedule
+from pharos.hardness.representation.learning import Adam, Representation, Rollouts, Schedule
 from pharos.hardness.representation.sampled_regret import Sampling
 from pharos.mdp import TabularMDP, check_horizon, require_mdp
 from pharos.system import storage
@@ -133,6 +133,7 @@ def report(  # noqa: PLR0913
     schedule: Schedule | None = None,
     rollouts: Rollouts | None = None,
     sampling: Sampling | None = None,
+    adam: Adam | None = None,
     folder: str | os.PathLike | None = None,
 ) -> Report:
     """Measure how hard an MDP is.
@@ -152,8 +153,8 @@ def report(  # noqa: PLR0913
         on_result: called with each `Result` as soon as it is there.
         representation: what the agent's network makes of the states, `pharos.observations.representation`. With one,
             measures of it are part of the report.
-        schedule: of the idealised learner that these have. rollouts: of the actor-critic. sampling: of the learner that
-            draws.
+        schedule: of the idealised learner that these have. rollouts: of the actor-critic. sampling: of the learners
+            that draw. adam: of those that step as an agent does.
         folder: for optimal values (`optimal.npy`, which `value_iteration(..., values=)` knows as well) and for the
             bounds of a diameter while they are computed, in place of memory: the same call goes on from them after one
             was killed, or a budget spent. None: memory, or, if that has little room, files without a name.
@@ -168,7 +169,7 @@ def report(  # noqa: PLR0913
     check_horizon(horizon)
     wanted = selected_measures(measures, representation is not None)
     schedule = schedule or Schedule()
-    options = (representation, schedule, rollouts, sampling, None if folder is None else Path(folder))
+    options = (representation, schedule, rollouts, sampling, adam, None if folder is None else Path(folder))
     is_strict = budget is not None
     problem = Problem(mdp, horizon, tolerance, restart, Budget.of(budget), progress, *options, is_strict)
     conventions = _problem_conventions(problem)
@@ -243,6 +244,8 @@ def _problem_conventions(problem: Problem) -> dict[str, Any]:
         represented["rollouts"] = problem.rollouts.to_dict()
     if representation is not None and problem.sampling is not None:
         represented["sampling"] = problem.sampling.to_dict()
+    if representation is not None and problem.adam is not None:
+        represented["adam"] = asdict(problem.adam)
     return {
         **represented,
         "gamma": float(mdp.gamma),
@@ -265,7 +268,7 @@ REPORT_FILE = "hardness.json"
 REPORT_FORMAT = 2
 
 # Conventions that the results of a measure depend on, by its `depends`; else all, but for these if it is "all".
-_OF_REPRESENTATIONS = ("representation", "schedule", "rollouts")
+_OF_REPRESENTATIONS = ("representation", "schedule", "rollouts", "adam")
 _DEPENDS = {
     "structure": ("chance", "restart"),
     "values": ("chance", "gamma", "horizon_of_values", "tolerance"),

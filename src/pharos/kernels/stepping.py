@@ -16,6 +16,7 @@ from numba import float64, types, uint64
 from numba.extending import overload
 
 from pharos.kernels.bellman import reward_at, set_has
+from pharos.kernels.idealised_network import adam_step, add_error, squared_gradients
 from pharos.kernels.kernel_cache import inlined, kernel
 from pharos.kernels.outcomes import drawn, drawn_outcome, is_table, outcome, size_of
 
@@ -509,12 +510,23 @@ def _product(x, y):
     return total
 
 
-@inlined
 def _q_value(kernel, learned, c, a):
-    """Q(c, a), of the tabular part and the features."""
-    _, features, _ = kernel
-    q, weights = learned
-    return q[a, c] + _product(features[c], weights[a]) if features.shape[1] > 0 else q[a, c]
+    """Q(c, a), of the tabular part and the features; of a network or its target: of the array of its outputs."""
+
+
+@overload(_q_value, jit_options={"forceinline": True})
+def _q_value_of(kernel, learned, c, a):
+    if isinstance(learned, types.Array):
+        return lambda kernel, learned, c, a: learned[a, c]
+    if isinstance(learned, types.NamedTuple):
+        return lambda kernel, learned, c, a: learned.outputs[a, c]
+
+    def of_kernel(kernel, learned, c, a):
+        _, features, _ = kernel
+        q, weights = learned
+        return q[a, c] + _product(features[c], weights[a]) if features.shape[1] > 0 else q[a, c]
+
+    return of_kernel
 
 
 @inlined
@@ -576,7 +588,9 @@ def learn(outcomes, group, episodes, values, walk, schedule, steps):
     outcomes: (offsets (S A + 1,), states (N,), -1 for the end; rewards (N,); cumulative probabilities of a row (N,)).
     group: (S,) the observation of each state; episodes: see `Episodes`, with sets of observations (C, A).
     values: (kernel, learnt, target). kernel: (K (C, C) or (0, 0), F (C, m), diagonal (C,)); learnt, target: each
-    (q (A, C), weights (A, m)), of which target stays as it is. walk: see `Walk`.
+    (q (A, C), weights (A, m)), of which target stays as it is. Or of a network: (constants of Adam as for
+    `idealised_network.adam_step` and the length to which gradients are clipped; the network; target outputs (A, C)).
+    walk: see `Walk`.
     schedule: (gamma, first epsilon, last epsilon, steps of exploration, first step of learning, gradient steps in so
     many steps: two numbers, largest step that does not overshoot; a minibatch takes that, or the largest that it bears
     itself; temporal differences are cut at the last number: 1 for the Huber loss, infinity for the squared one).
@@ -600,7 +614,7 @@ def learn(outcomes, group, episodes, values, walk, schedule, steps):
         # act, epsilon-greedy; before learning begins, at random
         share = min(1.0, t / exploration) if exploration > 0 else 1.0
         epsilon = first_epsilon + share * (last_epsilon - first_epsilon) if t >= begin else 1.0
-        action = _act(kernel, learned, chance, c, epsilon, word)
+        action = _act(kernel, learned, chance, c, epsilon, word, num_actions)
         visits[c, action] += 1
         executed = redrawn_action(action, cursor[1], chance, num_actions, word, c)
         row = s * num_actions + executed
@@ -627,9 +641,8 @@ def learn(outcomes, group, episodes, values, walk, schedule, steps):
 
 
 @kernel(makes_arrays=False, forceinline=True)
-def _act(kernel, learned, chance, c, epsilon, word):
+def _act(kernel, learned, chance, c, epsilon, word, num_actions):
     """An epsilon-greedy action for observation c, ties at random."""
-    num_actions = len(learned[0])
     if uniform_number(word, 0) < epsilon:
         return action_of_set(chance, num_actions, word, c)
     best, ties, action = -np.inf, 1, 0
@@ -682,17 +695,48 @@ def _learn_minibatch(values, walk, chance, limits, num_stored):
             y += gamma * best
         error = y - _q_value(kernel, learned, observations[j], actions[j])
         errors[i] = min(max(error, -largest_error), largest_error)
-    # largest step of this minibatch that does not overshoot, by the row sums of its kernel (Gershgorin)
-    bound = 0.0
-    for i in range(size):
-        total = 0.0
-        for j in range(size):
-            if actions[batch[i]] == actions[batch[j]]:
-                total += abs(_likeness(kernel, observations[batch[i]], observations[batch[j]]))
-        bound = max(bound, total / size)
-    if bound <= 0.0:
-        return
-    # move Q along the kernel of each transition
-    step = min(largest_step, 1.0 / bound) / size
-    for i in range(size):
-        _gradient_step(kernel, learned, observations[batch[i]], actions[batch[i]], step * errors[i])
+    _step(kernel, learned, (observations, actions, batch, errors), largest_step)
+
+
+def _step(kernel, learned, drawn_errors, largest_step):
+    """A gradient step on the errors of a minibatch: in a kernel the largest that it bears, at most `largest_step`; of a
+    network the next one of Adam, whose constants are in the place of the kernel.
+
+    drawn_errors: (observations, actions, places of the minibatch in both, its temporal differences).
+    """
+
+
+@overload(_step)
+def _step_of(kernel, learned, drawn_errors, largest_step):
+    if isinstance(learned, types.NamedTuple):
+
+        def of_network(kernel, learned, drawn_errors, largest_step):
+            observations, actions, batch, errors = drawn_errors
+            for i in range(len(batch)):
+                add_error(learned, actions[batch[i]], observations[batch[i]], errors[i] / len(batch))
+            of_last, of_beneath = squared_gradients(learned)
+            optimizer, most = kernel
+            share = min(1.0, most / (np.sqrt(of_last + of_beneath) + 1e-6))
+            adam_step(learned, of_last, of_beneath, share, optimizer)
+
+        return of_network
+
+    def of_kernel(kernel, learned, drawn_errors, largest_step):
+        observations, actions, batch, errors = drawn_errors
+        size = len(batch)
+        # largest step of this minibatch that does not overshoot, by the row sums of its kernel (Gershgorin)
+        bound = 0.0
+        for i in range(size):
+            total = 0.0
+            for j in range(size):
+                if actions[batch[i]] == actions[batch[j]]:
+                    total += abs(_likeness(kernel, observations[batch[i]], observations[batch[j]]))
+            bound = max(bound, total / size)
+        if bound <= 0.0:
+            return
+        # move Q along the kernel of each transition
+        step = min(largest_step, 1.0 / bound) / size
+        for i in range(size):
+            _gradient_step(kernel, learned, observations[batch[i]], actions[batch[i]], step * errors[i])
+
+    return of_kernel

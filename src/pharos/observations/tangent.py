@@ -1,6 +1,8 @@
 """Observations of states as networks take them, and their tangent kernels: doors to `hardness.representation`."""
 
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +12,7 @@ from pharos.environments import Environment, make
 from pharos.errors import ParameterError
 from pharos.hardness import (
     Network,
+    OutputLayer,
     Representation,
     check_memory,
     default_network,
@@ -138,11 +141,13 @@ def representation(
     first = network_inputs(observer, space.states(slice(0, 1)))
     if callable(network) or sources.is_reference(network):
         tangent, named = kernel_of_module(network, first.shape[1:])
+        layers = None
     else:
         net = Network.of(default_network(observer.space) if network is None else network, initialisation)
         tangent, named = partial(tangent_kernel, net), {"network": net.name, "initialisation": net.initialisation}
         if net.tanh and net.initialisation == "sb3":
             named["kernel"] = 2  # results that were kept of zeros without a slope are not taken
+        layers = _output_layer(net, first.shape[1:])
     tangent(first, None)  # what does not fit is said before all states are looked at
 
     def inputs(states: np.ndarray) -> np.ndarray:
@@ -168,7 +173,20 @@ def representation(
             "digest": _inputs_digest(inputs, space.num_states),
         },
         covariance=partial(pairs, partial(tangent, of_outputs=True)),
+        output_layer=None if layers is None else replace(layers, kernel=partial(pairs, layers.kernel)),
     )
+
+
+def _output_layer(network: Network, shape: Sequence[int]) -> OutputLayer:
+    """The output layer of a network, whose kernel takes inputs: of the covariance v h(x) . h(y) + b of its outputs."""
+    units = network.hidden[-1]
+    weight, bias = network.weight_variances(units, 1, is_output=True)
+
+    def kernel(x: np.ndarray, y: np.ndarray | None = None) -> np.ndarray:
+        return (tangent_kernel(network, x, y, of_outputs=True) - np.float32(bias)) / np.float32(weight) + 1
+
+    largest = units + 1.0 if network.tanh and len(network.hidden) > 1 else math.inf
+    return OutputLayer(kernel, units * weight, network.parameters(shape), network.evenness, largest)
 
 
 def _inputs_digest(inputs: Callable[[np.ndarray], np.ndarray], num_states: int) -> str:

@@ -25,6 +25,26 @@ MOST_WITHOUT_LANDMARKS = 4096
 DEFAULT_LANDMARKS = 600
 
 
+@dataclass(frozen=True)
+class OutputLayer:
+    """A network's output layer beside the layers beneath it, for learners that step as its optimizer does.
+
+    Attributes:
+        kernel: as of `Representation`, of the parameters of one output alone: h(x) . h(y) + 1, h the last hidden units.
+        weights: expected sum of the squared weights of an output before training, bias aside.
+        parameters: numbers of parameters: of one output, and of all layers beneath.
+        evenness: of the output layer and of the layers beneath: the mean size of a parameter's gradient as a share of
+            its root mean square. Adam moves each parameter alike, so that 1 is where all have the same gradient.
+        largest: of h(x) . h(x) + 1. Infinite for ReLUs.
+    """
+
+    kernel: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    weights: float
+    parameters: tuple[int, int]
+    evenness: tuple[float, float]
+    largest: float = math.inf
+
+
 @dataclass(frozen=True, eq=False)
 class Representation:
     """An observation and a network, as measures see them. `pharos.observations.representation` makes one.
@@ -38,6 +58,7 @@ class Representation:
             takes. 2 or more are used for all sizes.
         conventions: what it is, JSON-able.
         covariance: as `kernel`, the covariance of an output of the network before training. None if it is not known.
+        output_layer: the network in two groups of parameters. None if they are not known apart.
     """
 
     kernel: Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -46,6 +67,7 @@ class Representation:
     landmarks: int | None = None
     conventions: Mapping[str, Any] = field(default_factory=dict)
     covariance: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None
+    output_layer: OutputLayer | None = None
 
     def __post_init__(self) -> None:
         if self.landmarks == 1:
@@ -378,12 +400,19 @@ class Rollouts:
         gae_lambda: weight of longer returns, in returns and advantages.
         clip_range: PPO's: how far the probability of an action moves, as a share of itself, before it is no longer
             pushed further. None: no clipping.
+        environments, epochs, entropy_weight, value_weight: of `network_policy_regret` alone: environments that a
+            rollout is divided among, passes over it, and the weights of the entropy bonus and of the squared errors of
+            values. None: 8, 4, 0.01 and 0.5.
     """
 
     steps: int = 512
     gradient_steps: int = 16
     gae_lambda: float = 0.95
     clip_range: float | None = None
+    environments: int | None = None
+    epochs: int | None = None
+    entropy_weight: float | None = None
+    value_weight: float | None = None
 
     def __post_init__(self) -> None:
         for name in ("steps", "gradient_steps"):
@@ -392,10 +421,45 @@ class Rollouts:
             raise ParameterError(f"rollouts: gae_lambda is {self.gae_lambda!r}; expected a number in [0, 1]")
         if self.clip_range is not None and not self.clip_range > 0:
             raise ParameterError(f"rollouts: clip_range is {self.clip_range!r}; expected a number above 0, or None")
+        for name in ("environments", "epochs"):
+            if getattr(self, name) is not None:
+                whole_number(getattr(self, name), f"rollouts: {name}")
+        if self.environments is not None and self.steps % self.environments:
+            raise ParameterError(f"rollouts: {self.steps} steps are not divided by {self.environments} environments")
+        for name in ("entropy_weight", "value_weight"):
+            value = getattr(self, name)
+            if value is not None and not (math.isfinite(value) and value >= 0):
+                raise ParameterError(f"rollouts: {name} is {value!r}; expected at least 0")
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able. Without `clip_range` if there is none, as it was before there could be one."""
+        """JSON-able. Without what is None, as it was before there could be more."""
         return {name: value for name, value in asdict(self).items() if value is not None}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Adam:
+    """The optimizer of the learners that step as an agent does (Kingma and Ba, 2015).
+
+    Attributes:
+        learning_rate: of every step.
+        max_grad_norm: length to which gradients are clipped.
+        epsilon: added to the root mean square of a gradient.
+        decay, decay_of_squares: of the means of gradients and of their squares.
+    """
+
+    learning_rate: float = 0.001
+    max_grad_norm: float = 10.0
+    epsilon: float = 1e-8
+    decay: float = 0.9
+    decay_of_squares: float = 0.999
+
+    def __post_init__(self) -> None:
+        for name in ("learning_rate", "max_grad_norm", "epsilon"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ParameterError(f"adam: {name} is {getattr(self, name)!r}; expected a number above 0")
+        for name in ("decay", "decay_of_squares"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ParameterError(f"adam: {name} is {getattr(self, name)!r}; expected a number in [0, 1)")
 
 
 @dataclass(frozen=True, eq=False)

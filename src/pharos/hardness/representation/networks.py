@@ -111,6 +111,34 @@ class Network:
         gain = 1.0 if is_output else 2.0
         return gain / max(inputs, outputs), 0.0
 
+    def parameters(self, shape: Sequence[int]) -> tuple[int, int]:
+        """(of one output, of all layers beneath): numbers of parameters, for inputs of a shape."""
+        size, beneath = math.prod(shape), 0
+        if self.convolutions:
+            channels, sides = shape[0], tuple(shape[1:])
+            for layer in self.convolutions:
+                beneath += layer.filters * (channels * layer.size**2 + 1)
+                sides = tuple((side + 2 * layer.padding - layer.size) // layer.stride + 1 for side in sides)
+                channels = layer.filters
+            size = channels * math.prod(sides)
+        for units in self.hidden:
+            beneath += units * (size + 1)
+            size = units
+        return size + 1, beneath
+
+    @property
+    def evenness(self) -> tuple[float, float]:
+        """(of the output layer, of the weights of the last hidden layer): `OutputLayer.evenness`, in closed form.
+
+        Of one observation and many units, with pre-activations that are normal and, of hyperbolic tangents, small: a
+        ReLU is a half-normal number or 0, its slope 1 or 0. Of observations that differ gradients are more even.
+        """
+        normal, relu, gate = math.sqrt(2 / math.pi), math.sqrt(1 / math.pi), math.sqrt(1 / 2)
+        weight = math.sqrt(3) / 2 if self.initialisation == "pytorch" else normal  # uniform, or orthogonal
+        kinds = [normal if self.tanh and layer else relu for layer in range(len(self.hidden))]
+        slope = 1.0 if self.tanh and len(self.hidden) > 1 else gate
+        return kinds[-1], weight * slope * (kinds[-2] if len(kinds) > 1 else 1.0)
+
 
 def default_network(space: "gymnasium.Space") -> str:
     """The name of the network that agents get for a Gymnasium space of observations."""

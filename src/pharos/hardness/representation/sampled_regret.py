@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -31,6 +31,9 @@ from pharos.hardness.representation.learning import (
 from pharos.hardness.visitation import drawn_indices
 from pharos.mdp import TabularMDP, paid_outcomes, require_mdp, whole_number
 from pharos.solvers import Solution
+
+if TYPE_CHECKING:
+    from pharos.kernels.stepping import Episodes, Walk
 
 LOOKS = 30
 """Evaluations at equal distances, beside the one before the first step."""
@@ -302,46 +305,84 @@ class SampledLearner(IdealisedLearner):
         """Yield the learnt values (C, A) of one walk at each of the steps `looks`, ascending."""
         from pharos.kernels import stepping as kernels
 
-        schedule, sampling, mdp = self.schedule, self.sampling, self.whole
-        count, num_actions = len(observations), mdp.num_actions
-        group = np.full(mdp.num_states, -1, np.int64)
-        group[self.numbers] = observations.groups
+        count, num_actions = len(observations), self.whole.num_actions
         kernel = operator.parts(count)
         learnt = self.start(observations, seed), np.zeros((num_actions, kernel[1].shape[1]))
         target = tuple(each.copy() for each in learnt)
-        size = min(sampling.buffer_size, schedule.steps)
+        walk, vector, largest_step = self.first_walk(count, seed), np.full((count, 1), count**-0.5), 0.0
+        for step, run in self.stretches(observations, looks, walk):
+            if step in looks:
+                values = np.empty((count, num_actions))
+                kernels.kernel_values(kernel, learnt, values)
+                yield values
+            if self.is_copied(step):
+                for old, new in zip(target, learnt, strict=True):
+                    old[:] = new
+                weights = walk.visits.max(axis=1, keepdims=True) / max(step, 1)
+                largest = operator.largest_eigenvalue(weights, vector) if step else 0.0
+                largest_step = 1 / (STEP_MARGIN * largest) if largest > 0 else math.inf
+            run((kernel, learnt, target), largest_step)
+
+    def is_copied(self, step: int) -> bool:
+        """Whether the target network is copied at a step, of those between which the walk runs."""
+        period = self.schedule.period
+        return step % period == 0 and step + period > self.schedule.learning_starts
+
+    def first_walk(self, count: int, seed: int) -> "Walk":
+        """A walk before its first step, over so many observations."""
+        from pharos.kernels.stepping import Walk
+
+        sampling = self.sampling
+        size = min(sampling.buffer_size, self.schedule.steps)
         memory = *(np.zeros(size, np.int64) for _ in range(3)), np.zeros(size)
         minibatch = np.zeros(sampling.batch_size, np.int64), np.zeros(sampling.batch_size)
-        visits, cursor = np.zeros((count, num_actions)), np.array([-1, -1, 0, 0], np.int64)
-        words = np.random.SeedSequence(seed, spawn_key=(2,)).generate_state(2, np.uint64)
-        word, noise = words[:1].copy(), (float(sampling.reward_noise), words[1:].copy())
+        visits, cursor = np.zeros((count, self.whole.num_actions)), np.array([-1, -1, 0, 0], np.int64)
+        words = self.words(seed)
+        noise = float(sampling.reward_noise), words[1:].copy()
+        return Walk(memory, visits, cursor, words[:1].copy(), noise, minibatch)
+
+    def words(self, seed: int) -> np.ndarray:
+        """(2,) uint64: the streams of a walk, and of the noise of its rewards."""
+        return np.random.SeedSequence(seed, spawn_key=(2,)).generate_state(2, np.uint64)
+
+    def course(self, observations: Grouped) -> tuple[np.ndarray, "Episodes"]:
+        """((S,) observations of states, -1 where there is none; start, course and end of the episodes)."""
+        from pharos.kernels.stepping import Episodes
+
+        mdp = self.whole
+        group = np.full(mdp.num_states, -1, np.int64)
+        group[self.numbers] = observations.groups
+        chance = (*mdp.chance.triple[:2], 0.0, float(mdp.chance.first_chosen))
+        sets = () if observations.sets is None else (np.ascontiguousarray(observations.sets),)
+        cumulative = np.append(np.cumsum(mdp.start_probabilities[:-1]), 1.0)
+        starts, terminal = np.asarray(mdp.start_states, np.int64), np.asarray(mdp.terminal, np.bool_)
+        return group, Episodes(terminal, starts, cumulative, (*chance, *sets), self.episode)
+
+    def stretches(
+        self, observations: Grouped, looks: np.ndarray, walk: "Walk"
+    ) -> Iterator[tuple[int, Callable[[Any, float], None]]]:
+        """Yield (step, a function that walks from it to the next) of all steps at which there is something to do.
+
+        The function takes (kernel, learnt, target) as `kernels.stepping.learn` does, and the largest step of descent.
+        """
+        from pharos.kernels import stepping as kernels
+
+        schedule = self.schedule
+        group, episodes = self.course(observations)
         numbers = (
             *(schedule.gamma, schedule.exploration_initial_eps, schedule.exploration_final_eps),
             schedule.exploration_fraction * schedule.steps,
             *(int(schedule.learning_starts), int(schedule.gradient_steps), int(schedule.period)),
         )
-        chance = (*mdp.chance.triple[:2], 0.0, float(mdp.chance.first_chosen))
-        sets = () if observations.sets is None else (np.ascontiguousarray(observations.sets),)
-        cumulative = np.append(np.cumsum(mdp.start_probabilities[:-1]), 1.0)
-        starts, terminal = np.asarray(mdp.start_states, np.int64), np.asarray(mdp.terminal, np.bool_)
-        episodes = kernels.Episodes(terminal, starts, cumulative, (*chance, *sets), self.episode)
-        state = kernels.Walk(memory, visits, cursor, word, noise, minibatch)
-        vector, largest_step = np.full((count, 1), count**-0.5), 0.0
         stops = np.unique([*looks, *range(0, schedule.steps, schedule.period)])
         for step, next_stop in zip(stops, [*stops[1:], schedule.steps], strict=True):
             self.report(f"step {step:,} of {schedule.steps:,} of a walk")
-            if step in looks:
-                values = np.empty((count, num_actions))
-                kernels.kernel_values(kernel, learnt, values)
-                yield values
-            if step % schedule.period == 0 and step + schedule.period > schedule.learning_starts:
-                for old, new in zip(target, learnt, strict=True):
-                    old[:] = new
-                weights = visits.max(axis=1, keepdims=True) / max(step, 1)
-                largest = operator.largest_eigenvalue(weights, vector) if step else 0.0
-                largest_step = 1 / (STEP_MARGIN * largest) if largest > 0 else math.inf
-            learning = (kernel, learnt, target), state, (*numbers, largest_step, self.largest_error)
-            kernels.learn(self.outcomes, group, episodes, *learning, int(next_stop - step))
+
+            def run(values: Any, largest_step: float, steps: int = int(next_stop - step)) -> None:
+                settings = (*numbers, largest_step, self.largest_error)
+                kernels.learn(self.outcomes, group, episodes, values, walk, settings, steps)
+
+            yield int(step), run
 
 
 # With the agent's loss, from a random network -------------------------------------------------------------------------
