@@ -18,6 +18,9 @@ from pharos.agents.agent import (
 )
 from pharos.agents.idealised import (
     HUBER_PREDICTORS,
+    NETWORK_CURVE,
+    NETWORK_POLICY_PREDICTORS,
+    NETWORK_PREDICTORS,
     POLICY_CURVES,
     POLICY_PREDICTORS,
     SAMPLED_PREDICTORS,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from pharos.hardness import Result, Rollouts, Schedule
+    from pharos.hardness import Adam, Result, Rollouts, Schedule
     from pharos.mdp import TabularMDP
 
 POLICY_PREDICTORS = (
@@ -25,7 +25,12 @@ SAMPLED_PREDICTORS = ("sampled_regret", "sampled_deviation", "sampled_descent", 
 """Columns of predictions of a DQN: the sampled learner, one walk's deviation, its two kernels, and a table's."""
 HUBER_PREDICTORS = ("huber_regret", "huber_deviation", "huber_descent", "huber_adam", "huber_tabular")
 """The same of the sampled learner with the Huber loss that begins at a random network."""
+NETWORK_PREDICTORS = ("network_regret", "network_deviation", "network_tabular_regret")
+"""The same of a DQN in an idealised network: `network_regret`, one walk's deviation, a table's."""
+NETWORK_POLICY_PREDICTORS = tuple(name.replace("network", "network_policy") for name in NETWORK_PREDICTORS)
+"""The same of a PPO: `network_policy_regret`."""
 POLICY_CURVES = ("policy_curve", "clipped_curve")
+NETWORK_CURVE = "network_curve"
 CURVE_POINTS = 40
 
 Configuration = Mapping[str, Any]
@@ -41,16 +46,15 @@ class Idealised:
         predictor: the column that stands for the agent, named before the runs of a sealed test. Empty if there is none.
         initialisation: of the network, see `pharos.observations.representation`.
         suffix: of the network's name.
-        large_unit, large_unit_miss: V* - U from which on the agent was worse than predicted on published cells, and by
-            how much regret in the mean. The prediction does not depend on the unit of rewards.
+        fallback: the measure in its place for a network whose output layer is not known, and for more different
+            observations than it is for.
     """
 
     kind: str = "both"
     predictor: str = ""
     initialisation: str = "sb3"
     suffix: str = "+tanh"
-    large_unit: float = math.inf
-    large_unit_miss: float = 0.0
+    fallback: str = ""
 
     def schedule(self, config: Configuration) -> "Schedule":
         """The schedule of the agent."""
@@ -71,11 +75,18 @@ class Idealised:
         return {}
 
     def primary(self, config: Configuration, mdp: "TabularMDP", options: Mapping[str, Any]) -> "Result":
-        """The result that `predictor` is a number of."""
+        """The result that `predictor` is a number of, or its fallback."""
+        from pharos.hardness import is_for_networks
+
+        is_known = is_for_networks(options["representation"])
+        return self.result(self.predictor if is_known else self.fallback, config, mdp, options)
+
+    def result(self, measure: str, config: Configuration, mdp: "TabularMDP", options: Mapping[str, Any]) -> "Result":
+        """The result of a measure of the idealised learner."""
         raise NotImplementedError
 
-    def primary_columns(self, value: Mapping[str, Any] | None) -> dict[str, Any]:
-        """Columns of the value of `primary`, NaN if there is none."""
+    def primary_columns(self, measure: str, value: Mapping[str, Any] | None) -> dict[str, Any]:
+        """Columns of the value of a measure of `primary`, NaN if there is none."""
         return {}
 
     def regret(self, value: Mapping[str, Any]) -> float:
@@ -85,10 +96,11 @@ class Idealised:
 
 @dataclass(frozen=True, kw_only=True)
 class IdealisedDQN(Idealised):
-    """The learner that draws what a DQN draws, with its loss and its start: `huber_regret`."""
+    """A DQN in an idealised network: `network_regret`."""
 
     kind: str = "dqn"
-    predictor: str = "huber_regret"
+    predictor: str = "network_regret"
+    fallback: str = "huber_regret"
     initialisation: str = "pytorch"
     suffix: str = ""
 
@@ -108,23 +120,27 @@ class IdealisedDQN(Idealised):
         return int(config["hyperparameters"].get("learning_starts", 0)) + 1, "learning begins"
 
     def columns(self, config: Configuration, mdp: "TabularMDP", options: Mapping[str, Any]) -> dict[str, Any]:
-        sampled = self._result("sampled_regret", config, mdp, options).value
-        return {**_parts(SAMPLED_PREDICTORS, sampled), **self.primary_columns(self.primary(config, mdp, options).value)}
+        sampled = self.result("sampled_regret", config, mdp, options).value
+        row = _parts(SAMPLED_PREDICTORS, sampled)
+        for measure in dict.fromkeys((self.fallback, self.primary(config, mdp, options).name)):
+            row |= self.primary_columns(measure, self.result(measure, config, mdp, options).value)
+        return row
 
-    def primary(self, config: Configuration, mdp: "TabularMDP", options: Mapping[str, Any]) -> "Result":
-        return self._result(self.predictor, config, mdp, options)
-
-    def _result(self, measure: str, config: Configuration, mdp: "TabularMDP", options: Mapping[str, Any]) -> "Result":
+    def result(self, measure: str, config: Configuration, mdp: "TabularMDP", options: Mapping[str, Any]) -> "Result":
         from pharos.hardness import Sampling, report
 
         hyperparameters, chance = config["hyperparameters"], config["chance"]
         sizes = {name: int(hyperparameters[name]) for name in ("batch_size", "buffer_size") if name in hyperparameters}
-        noise, scale = float(chance.get("reward_noise", 0.0)), float(chance.get("scale_rewards") or 1.0)
-        sampling = Sampling(reward_noise=noise, reward_scale=scale, **sizes)
-        return report(mdp, [measure], schedule=self.schedule(config), sampling=sampling, **options)[measure]
+        sampling = Sampling(**_paid(chance), **sizes)
+        adam: dict[str, Any] = {}
+        if measure == self.predictor:
+            adam["adam"] = _adam(hyperparameters, max_grad_norm=10.0)
+        return report(mdp, [measure], schedule=self.schedule(config), sampling=sampling, **adam, **options)[measure]
 
-    def primary_columns(self, value: Mapping[str, Any] | None) -> dict[str, Any]:
-        return _parts(HUBER_PREDICTORS, value)
+    def primary_columns(self, measure: str, value: Mapping[str, Any] | None) -> dict[str, Any]:
+        if measure == self.fallback:
+            return _parts(HUBER_PREDICTORS, value)
+        return _network_columns(NETWORK_PREDICTORS, value)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,31 +171,58 @@ class IdealisedActorCritic(Idealised):
 
     def columns(self, config: Configuration, mdp: "TabularMDP", options: Mapping[str, Any]) -> dict[str, Any]:
         rollouts = self.rollouts(config)
-        regret = self._result(config, mdp, replace(rollouts, clip_range=None), options).value
-        clipped = None if rollouts.clip_range is None else self.primary(config, mdp, options).value
-        row = self.primary_columns(None)
+        regret = self._kernel_result(config, mdp, replace(rollouts, clip_range=None), options).value
+        row: dict[str, Any] = {**dict.fromkeys(POLICY_PREDICTORS, math.nan), **dict.fromkeys(POLICY_CURVES, "")}
         if regret is not None:
             numbers = (regret["value"], regret["played"], regret["tabular"], self.regret(regret))
             row |= {**dict(zip(POLICY_PREDICTORS, numbers, strict=False)), "policy_curve": curve_points(regret)}
-        return row | ({} if clipped is None else self._clipped_columns(clipped))
+        if rollouts.clip_range is not None:
+            row |= self._clipped_columns(self._kernel_result(config, mdp, rollouts, options).value)
+        if self.predictor:
+            result = self.primary(config, mdp, options)
+            row |= self.primary_columns(result.name, result.value) if result.name == self.predictor else {}
+        return row
 
-    def primary(self, config: Configuration, mdp: "TabularMDP", options: Mapping[str, Any]) -> "Result":
-        return self._result(config, mdp, self.rollouts(config), options)
+    def result(self, measure: str, config: Configuration, mdp: "TabularMDP", options: Mapping[str, Any]) -> "Result":
+        from pharos.hardness import Sampling, report
 
-    def _result(
+        rollouts, hyperparameters = self.rollouts(config), config["hyperparameters"]
+        if measure != self.predictor:
+            return self._kernel_result(config, mdp, rollouts, options)
+        environments = int(hyperparameters.get("n_envs", 1))
+        rollouts = replace(
+            rollouts,
+            environments=environments,
+            epochs=int(hyperparameters.get("n_epochs", 1)),
+            entropy_weight=float(hyperparameters.get("ent_coef", 0.0)),
+            value_weight=float(hyperparameters.get("vf_coef", 0.5)),
+        )
+        adam = _adam(hyperparameters, max_grad_norm=0.5, epsilon=1e-5)
+        drawn: dict[str, Any] = {"rollouts": rollouts, "sampling": Sampling(**_paid(config["chance"])), "adam": adam}
+        return report(mdp, [measure], schedule=self._steps(config), **drawn, **options)[measure]
+
+    def _steps(self, config: Configuration) -> "Schedule":
+        """The schedule with the agent's steps and discount."""
+        from pharos.hardness import Schedule
+
+        return Schedule(steps=config["steps"], gamma=config["hyperparameters"].get("gamma", Schedule.gamma))
+
+    def _kernel_result(
         self, config: Configuration, mdp: "TabularMDP", rollouts: "Rollouts", options: Mapping[str, Any]
     ) -> "Result":
-        from pharos.hardness import Schedule, report
+        from pharos.hardness import report
 
         name = "kernel_policy_regret"
-        schedule = Schedule(steps=config["steps"], gamma=config["hyperparameters"].get("gamma", Schedule.gamma))
-        return report(mdp, [name], schedule=schedule, rollouts=rollouts, **options)[name]
+        return report(mdp, [name], schedule=self._steps(config), rollouts=rollouts, **options)[name]
 
-    def primary_columns(self, value: Mapping[str, Any] | None) -> dict[str, Any]:
-        row = {**dict.fromkeys(POLICY_PREDICTORS, math.nan), **dict.fromkeys(POLICY_CURVES, "")}
-        return row if value is None else row | self._clipped_columns(value)
+    def primary_columns(self, measure: str, value: Mapping[str, Any] | None) -> dict[str, Any]:
+        if measure == self.predictor:
+            return _network_columns(NETWORK_POLICY_PREDICTORS, value)
+        return self._clipped_columns(value)
 
-    def _clipped_columns(self, regret: Mapping[str, Any]) -> dict[str, Any]:
+    def _clipped_columns(self, regret: Mapping[str, Any] | None) -> dict[str, Any]:
+        if regret is None:
+            return {}
         numbers = {"clipped_regret": regret["value"], "clipped_regret_evaluated": self.regret(regret)}
         return numbers | {
             "clipped_tabular_regret": regret["tabular"],
@@ -187,10 +230,35 @@ class IdealisedActorCritic(Idealised):
         }
 
     def regret(self, value: Mapping[str, Any]) -> float:
-        """Mean regret as evaluated, `LearningCurve.mean_evaluated`, computed anew: older results lack it."""
+        """Mean regret as evaluated; of the kernel's learner computed anew from its curve, as older results lack it."""
         from pharos.hardness import LearningCurve
 
+        if "played" not in value["curve"]:
+            return float(value["value"])
         return LearningCurve(**{name: np.asarray(values) for name, values in value["curve"].items()}).mean_evaluated
+
+
+def _adam(hyperparameters: Mapping[str, Any], **defaults: float) -> "Adam":
+    """Adam of an agent. defaults: of Stable-Baselines3, if its hyperparameters do not say."""
+    from pharos.hardness import Adam
+
+    own = {name: hyperparameters[name] for name in ("learning_rate", "max_grad_norm") if name in hyperparameters}
+    return Adam(**{**defaults, **{name: float(value) for name, value in own.items()}})
+
+
+def _paid(chance: Mapping[str, Any]) -> dict[str, Any]:
+    """Noise and scale of the rewards that are paid, as `Sampling` has them."""
+    noise, scale = float(chance.get("reward_noise", 0.0)), float(chance.get("scale_rewards") or 1.0)
+    return {"reward_noise": noise, "reward_scale": scale}
+
+
+def _network_columns(names: Sequence[str], value: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Columns of the value of an idealised network: the mean, one walk's deviation, a table's; and its curve."""
+    numbers: dict[str, Any] = dict.fromkeys(names, math.nan) | {NETWORK_CURVE: ""}
+    if value is None:
+        return numbers
+    of_value = (value["value"], value.get("deviation", math.nan), value["tabular"])
+    return {**dict(zip(names, of_value, strict=True)), NETWORK_CURVE: curve_points(value)}
 
 
 def _parts(names: Sequence[str], value: Mapping[str, Any] | None) -> dict[str, float]:

@@ -27,8 +27,6 @@ PPO = BatchedAgent(
         "ent_coef": ("log", 1e-4, 0.1),
         "clip_range": ("one of", 0.1, 0.2, 0.3),
     },
-    idealised=IdealisedActorCritic(
-        predictor="clipped_regret_evaluated", clip_range=0.2, large_unit=50.0, large_unit_miss=0.16
-    ),
+    idealised=IdealisedActorCritic(predictor="network_policy_regret", fallback="kernel_policy_regret", clip_range=0.2),
     relatives=("trpo",),
 )

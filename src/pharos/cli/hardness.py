@@ -34,7 +34,10 @@ if TYPE_CHECKING:
 
 # What the column "exact" says of each kind of certificate.
 PROVEN = {"exact": "yes", "interval": "interval", "float64": "float64"}
-IDEALISED = ("kernel_regret", "kernel_policy_regret", "sampled_regret", "huber_regret")
+IDEALISED = (
+    *("kernel_regret", "kernel_policy_regret", "sampled_regret", "huber_regret"),
+    *("network_regret", "network_policy_regret"),
+)
 
 
 def hardness(

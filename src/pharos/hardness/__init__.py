@@ -41,7 +41,12 @@ from pharos.hardness.representation.learning import (
     Rollouts,
     Schedule,
 )
-from pharos.hardness.representation.network_regret import NetworkRegret, network_policy_regret, network_regret
+from pharos.hardness.representation.network_regret import (
+    NetworkRegret,
+    is_for_networks,
+    network_policy_regret,
+    network_regret,
+)
 from pharos.hardness.representation.sampled_regret import SampledRegret, Sampling, huber_regret, sampled_regret
 from pharos.hardness.steps import ReturnDistribution, return_distribution
 from pharos.hardness.value_norm import ActionGapRegularity, action_gap_regularity, environmental_value_norm

@@ -92,7 +92,7 @@ def _of_primary(config: Mapping[str, Any], mdp: "TabularMDP", options: Mapping[s
     result = idealised.primary(config, mdp, options)
     error = math.nan if result.value is None else result.value["estimated_error"]
     notes = result.undefined or result.certificate.note or ""
-    return {**idealised.primary_columns(result.value), "estimated_error": error, "notes": notes}
+    return {**idealised.primary_columns(result.name, result.value), "estimated_error": error, "notes": notes}
 
 
 def _idealised(config: Mapping[str, Any]) -> "Idealised":
@@ -127,7 +127,7 @@ class PrimaryRegret:
     """Predicted regret of an agent, by the predictor that stands for it.
 
     Attributes:
-        network: its name.
+        network: its name. measure: the predictor, or the one that stands in for it (`Idealised.fallback`).
         value: normalised regret of the learnt policies, a mean over training: 0 optimal, 1 uniform play.
         deviation: standard deviation of one walk of the idealised learner, NaN if nothing is drawn.
         tabular: of the same learner with a table of the states in the place of the network.
@@ -135,6 +135,7 @@ class PrimaryRegret:
     """
 
     network: str
+    measure: str = ""
     value: float
     tabular: float
     deviation: float
@@ -173,6 +174,7 @@ def primary_regret(
         raise UndefinedMeasure(result.undefined or f"{result.name} is undefined")
     return PrimaryRegret(
         network=str(options["representation"].conventions["network"]),
+        measure=result.name,
         value=idealised.regret(value),
         deviation=value.get("deviation", math.nan),
         tabular=value["tabular"],

@@ -215,9 +215,8 @@ def predict(
 ) -> Prediction:
     """Predict the regret of an agent behind each of some observations, before anything is trained.
 
-    The agent's network is replaced by its tangent kernel, and the agent by an idealised one that learns in it with the
-    same schedule: `huber_regret` for a DQN, `kernel_policy_regret` with PPO's clipping, as it is evaluated, for a
-    PPO. How far that agrees with runs was tested on classes that nobody had used (docs/prediction.md).
+    The agent's network is replaced by an idealised one, made of two kernels, in which the agent's own algorithm learns:
+    `network_regret` for a DQN, `network_policy_regret` for a PPO. How far that agrees with runs: docs/prediction.md.
 
     Args:
         environment: a name, with its parameters as keywords, or an Environment, such as one's own or
@@ -239,8 +238,7 @@ def predict(
     Raises:
         ParameterError: no such agent, observation or network, or more than MOST_STATES states.
         UndefinedMeasure: no policy beats uniform play, so that regret has no scale.
-    Cost: seconds for each cell of a thousand states, see `huber_regret` and `kernel_policy_regret`. Measures are kept
-        beside the state space.
+    Cost: seconds for each cell of a thousand states, see `network_regret`. Measures are kept beside the state space.
     """
     from pharos.agents import hyperparameters as hyperparameters_of
     from pharos.training import RunConfig, Task, TrainingOptions
@@ -302,7 +300,7 @@ def predict(
         published_classes=len(set(covering.classes)),
         warnings=(
             *_warnings(calibration, states, steps, spread, chance),
-            *_large_unit(agent, spread),
+            *_stand_ins(agent, cells),
             *_other_hyperparameters(agent, settings),
         ),
         hyperparameters=settings,
@@ -319,9 +317,9 @@ def regret_predictor(
 ) -> Callable[[Mapping[str, Any]], float]:
     """Return the function of hyperparameters that gives the predicted regret, a mean over environments and chances.
 
-    For `pharos.training.tune(predicted=...)`: what the idealised learner knows is the discount, the exploration, the
-    target network and the layers of a DQN, and the discount, the rollouts, epochs, lambda, clipping and layers of a
-    PPO.
+    For `pharos.training.tune(predicted=...)`: what the idealised learner knows is the learning rate, the discount, the
+    exploration, the minibatches, the target network and the layers of a DQN, and the learning rate, the discount, the
+    rollouts, epochs, minibatches, lambda, clipping, weights of losses and layers of a PPO.
 
     Args:
         agent: "dqn" or "ppo". environments, observation, steps: of the runs. chances: as for `tune`.
@@ -398,15 +396,14 @@ def _warnings(calibration: Published, states: int, steps: int, spread: float, ch
         yield f"{', '.join(untested)}: not among the tested cells, so the interval is not calibrated here"
 
 
-def _large_unit(agent: str, spread: float) -> Iterable[str]:
-    """A line if rewards are in a unit in which the agent was worse than predicted (`Idealised.large_unit`)."""
-    idealised = agent_called(agent).idealised
-    if spread >= idealised.large_unit:
+def _stand_ins(agent: str, cells: Iterable[PredictedRegret]) -> Iterable[str]:
+    """A line if another measure stands in for the predictor."""
+    predictor = primary_predictors()[agent]
+    for measure in dict.fromkeys(cell.measure for cell in cells if cell.measure != predictor):
+        labels = ", ".join(cell.label for cell in cells if cell.measure == measure)
         yield (
-            f"V* less the value of uniform play is {spread:,.6g}: the agent was worse than predicted by "
-            f"{idealised.large_unit_miss:g} in the mean where it was {idealised.large_unit:g} or more, and the "
-            "prediction does not depend on the unit of rewards; --scale-rewards range (in Python: "
-            "scale_rewards='range') trains in a smaller one"
+            f"{labels}: predicted by {measure}, as {predictor} is for at most 4,096 different observations, and "
+            "networks whose output layer is known; the interval is not calibrated here"
         )
 
 

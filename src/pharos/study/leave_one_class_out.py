@@ -13,7 +13,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pharos.agents import HUBER_PREDICTORS, POLICY_PREDICTORS, SAMPLED_PREDICTORS
+from pharos.agents import (
+    HUBER_PREDICTORS,
+    NETWORK_POLICY_PREDICTORS,
+    NETWORK_PREDICTORS,
+    POLICY_PREDICTORS,
+    SAMPLED_PREDICTORS,
+)
 from pharos.errors import ParameterError
 from pharos.prediction import PREDICTORS, Pairs
 from pharos.statistics import holm, percentiles, permutation_p_value, r_squared, spearman
@@ -32,7 +38,14 @@ OUTCOMES = {
 ABSOLUTE = "cumulative"  # in units of reward: judged only beside what random play would lose
 LINEAR = tuple(
     name
-    for name in (*PREDICTORS, *SAMPLED_PREDICTORS, *HUBER_PREDICTORS, *POLICY_PREDICTORS)
+    for name in (
+        *PREDICTORS,
+        *SAMPLED_PREDICTORS,
+        *HUBER_PREDICTORS,
+        *POLICY_PREDICTORS,
+        *NETWORK_PREDICTORS,
+        *NETWORK_POLICY_PREDICTORS,
+    )
     if "regret" in name or name == "aliasing_floor"
 )
 """Predictors that enter as they are; the others as logarithms."""
@@ -42,7 +55,10 @@ PERMUTATIONS = 4999
 CONTROL = "tabular_regret"
 IMAGES, VECTOR_NAME = ("simple_image", "complex_image", "recorded"), "vector"
 TABULAR, SCALE, CLASSES = "tabular measures", "random play", "class alone"
-TABULAR_PREDICTORS = ("tabular_regret", "tabular_regret_played", "policy_tabular_regret", "clipped_tabular_regret")
+TABULAR_PREDICTORS = (
+    *("tabular_regret", "tabular_regret_played", "policy_tabular_regret", "clipped_tabular_regret"),
+    *(NETWORK_PREDICTORS[2], NETWORK_POLICY_PREDICTORS[2]),
+)
 """Learners without a kernel."""
 BASELINE_MODELS = (CLASSES, SCALE, TABULAR, "exploration_time", "num_states", *TABULAR_PREDICTORS)
 P_VALUES = ("p_rho", "p_agreement", "p_slope")
@@ -192,8 +208,12 @@ def unseen_classes(
 
 def _predictors_of(predictions: "pd.DataFrame") -> list[str]:
     """Names of pharos' predictors, and of other columns of numbers, such as a user's measures."""
-    ours = (*PREDICTORS, SAMPLED_PREDICTORS[0], HUBER_PREDICTORS[0], *POLICY_PREDICTORS)
-    others = {*CELL, *SAMPLED_PREDICTORS, *HUBER_PREDICTORS, "estimated_error"}
+    ours = (
+        *(*PREDICTORS, SAMPLED_PREDICTORS[0], HUBER_PREDICTORS[0], *POLICY_PREDICTORS),
+        *(NETWORK_PREDICTORS[0], NETWORK_POLICY_PREDICTORS[0]),
+    )
+    drawn = *SAMPLED_PREDICTORS, *HUBER_PREDICTORS, *NETWORK_PREDICTORS, *NETWORK_POLICY_PREDICTORS
+    others = {*CELL, *drawn, "estimated_error"}
     added = [name for name in predictions if name not in (*ours, *others) and predictions[name].dtype.kind in "fiu"]
     return [*ours, *added]
 

@@ -17,8 +17,11 @@ if TYPE_CHECKING:
 
 MOST_PANELS = 24
 # Predictors and curves of the idealised learners; the first that there is counts.
-LEARNER_COLUMNS = ("clipped_regret_evaluated", "policy_regret", "kernel_regret")
-CURVES = ("clipped_curve", "policy_curve", "curve")
+LEARNER_COLUMNS = (
+    *("network_policy_regret", "network_regret"),
+    *("clipped_regret_evaluated", "policy_regret", "kernel_regret"),
+)
+CURVES = ("network_curve", "clipped_curve", "policy_curve", "curve")
 LONGEST_TITLE = 34
 
 

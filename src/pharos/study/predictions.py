@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, TypeAlias
 
 from pharos import training
-from pharos.agents import POLICY_CURVES
+from pharos.agents import NETWORK_CURVE, POLICY_CURVES
 from pharos.errors import FileFormatError, ParameterError, PharosError, ResultCorrupted
 from pharos.prediction import PREDICTORS
 from pharos.system.storage import plain
@@ -144,7 +144,9 @@ class PredictedCells:
                 f"{pluralize(len(twice), 'cell')} predicted twice, such as {', '.join(twice.iloc[0])}; "
                 "expected files of different cells"
             )
-        object.__setattr__(self, "cells", cells.fillna({name: "" for name in POLICY_CURVES if name in cells}))
+        object.__setattr__(
+            self, "cells", cells.fillna({name: "" for name in (*POLICY_CURVES, NETWORK_CURVE) if name in cells})
+        )
 
     @staticmethod
     def of(predictions: "Predictions | Sequence[Predictions] | None") -> "PredictedCells | None":

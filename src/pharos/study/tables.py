@@ -431,6 +431,8 @@ def predict(
         - `environment`, `instance`, `chance`, `agent`, `observation`, PREDICTORS, `network`
         - `estimated_error`: the error of `kernel_regret` if landmarks stand for the kernel
         - `curve` and `adam_curve`: the learner's steps and greedy regrets as JSON
+        - of the predictor that stands for the agent NETWORK_PREDICTORS or NETWORK_POLICY_PREDICTORS, and
+          `network_curve`
         - of actor-critics POLICY_PREDICTORS, `policy_curve`, and `clipped_curve`, the curve of the distribution over
           actions with PPO's clipping. NaN and "" in rows of others
         - `notes`: why a number is missing
@@ -443,7 +445,7 @@ def predict(
     """
     import pandas as pd
 
-    from pharos.agents import POLICY_CURVES
+    from pharos.agents import NETWORK_CURVE, POLICY_CURVES
     from pharos.prediction import predicted
 
     study, _ = opened(source, folder)
@@ -460,4 +462,4 @@ def predict(
     if not rows:
         raise ParameterError(f"study {study.name!r}: no agent learns from observations, so there is nothing to predict")
     frame = pd.DataFrame(list(rows.values()))
-    return frame.fillna({name: "" for name in POLICY_CURVES if name in frame})
+    return frame.fillna({name: "" for name in (*POLICY_CURVES, NETWORK_CURVE) if name in frame})

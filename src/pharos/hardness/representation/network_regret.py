@@ -180,6 +180,12 @@ def network_policy_regret(
     return learner.measured_in_network({"schedule": of_schedule, "rollouts": learner.rollouts.to_dict()})
 
 
+def is_for_networks(representation: Representation) -> bool:
+    """Whether `network_regret` takes a representation, as far as that shows before the states of episodes are known."""
+    numbers = int(representation.classes.max(initial=-1)) + 1
+    return representation.output_layer is not None and numbers <= MOST_OBSERVATIONS
+
+
 def schedule_of(learner: SampledLearner) -> dict[str, Any]:
     """The schedule of a learner, JSON-able. Its optimizer does not count."""
     return {name: value for name, value in asdict(learner.schedule).items() if name != "optimizer"}
