@@ -9,27 +9,32 @@
     python benchmarks/prediction_cells.py third [--cells cells.csv] [--resamples 1000]
     python benchmarks/prediction_cells.py pilots [--cells cells.csv] [--write]
     python benchmarks/prediction_cells.py draw [--cells cells.csv] [--picture docs/images/sealed.png]
+    python benchmarks/prediction_cells.py other [--picture docs/images/other-classes.png]
+    python benchmarks/prediction_cells.py ablations [--cells ablations.csv]
     python benchmarks/prediction_cells.py cost
 
 `compute` reads the packed runs of docs/studies (twelve development classes: hardness-dev; fourteen sealed ones:
 sealed-1; twice fourteen others: sealed-2 and sealed-3, blocks a to c) and computes the primary predictor of each cell,
-`huber_regret` of a DQN; those of a PPO and of sealed-3 are in the files of predictions. A row that is there already is
-not computed again. `judge` prints how well predictions agree with runs, by set and agent: number of cells, R2 of
-classes left out after a line, Spearman's rank correlation, the share of pairs of observations that are ordered rightly,
-R2 without a fit, half the width of the 80 % interval and the share of classes left out that it covers; in brackets 95 %
-intervals over classes drawn anew. Classes weigh alike. `orders` prints the pairs of observations by predicted
-difference. `held` prints by predicted regret what the interval held, and how wide one of these cells alone would be,
-and of each sealed set what such widths hold. `sealed` prints the same of the second sealed test, by block and
-predictor, and what the interval of before it held. `collect` puts predictions and packed runs of the third one into its
-table of cells. `third` prints its result, `huber_regret` beside `sampled_regret`, and what is missed by the unit of
-rewards. `pilots` prints how well a seed that is cut after a share of its steps predicts others in both last sets, with
-the measure and without. `draw` draws predicted against observed regret of the third sealed set. `cost` prints the
-seconds of a cell and the memory that it adds, each in a process of its own that has compiled, by states of a grid,
-agent and observation.
+and the one of before, `huber_regret` or `clipped_regret_evaluated`. A row that is there already is not computed again.
+`judge` prints how well predictions agree with runs, by set and agent, of both: number of cells, R2 of classes left out
+after a line, Spearman's rank correlation, the share of pairs of observations that are ordered rightly, R2 without a
+fit, half the width of the 80 % interval and the share of classes left out that it covers; in brackets 95 % intervals
+over classes drawn anew. Classes weigh alike. `orders` prints the pairs of observations by predicted difference. `held`
+prints by predicted regret what the interval held, and how wide one of these cells alone would be, and of each sealed
+set what such widths hold. `sealed` prints the same of the second sealed test, by block and predictor, and what the
+interval of before it held. `collect` puts predictions and packed runs of the third one into its table of cells. `third`
+prints its result, `huber_regret` beside `sampled_regret`, and what is missed by the unit of rewards. `other` prints the
+result of the ten classes of other-classes, and draws it. `ablations` computes the primary predictors with one part left
+out, on vectors and hashes of the second and third sealed set, and judges them. `pilots` prints how well a seed that is
+cut after a share of its steps predicts others in both last sets, with the measure and without. `draw` draws predicted
+against observed regret of the third sealed set. `cost` prints the seconds of a cell and the memory that it adds, each
+in a process of its own that has compiled, by states of a grid, agent and observation.
 """
 
 import argparse
+import contextlib
 import csv
+import functools
 import itertools
 import os
 import re
@@ -41,8 +46,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from pharos import study
-from pharos.agents import primary_predictors
+from pharos import hardness, study
+from pharos.agents import agent_called, primary_predictors
 from pharos.prediction import Published
 from pharos.prediction.calibration import BINS, CELLS_FILE, NUMBER_COLUMNS, REGRET_BINS
 from pharos.prediction.learners import primary_regret
@@ -72,7 +77,9 @@ BLOCKS = {
 }  # fmt: skip
 SEEDS = 4
 UNITS = 0.0, 0.5, 1.0, 3.0, 10.0, 20.0, 50.0, np.inf
-COLUMNS = ("study", *CELL, "steps", "states", "spread", "predicted", "observed", "seeds")
+COLUMNS = ("study", *CELL, "steps", "states", "spread", "predicted", "before", "observed", "seeds")
+BEFORE = {"dqn": "huber_regret", "ppo": "clipped_regret_evaluated"}
+"""Predictors until the third sealed test: columns of predictions."""
 
 
 def cells_of(specification, runs):
@@ -134,27 +141,34 @@ def compute(out, blocks):
                 if key not in cells or name in done:
                     continue
                 done.add(name)
-                value, states = regret_of(run, cells[key], told.get(key))
+                known = {**cells[key], **told.get(key, {})}
+                value, states = regret_of(run, known, primary_predictors()[run.config["agent"]])
+                before, _ = regret_of(run, known, BEFORE[run.config["agent"]])
                 if value == value:
                     row = {"steps": run.config["steps"], "states": int(states), "predicted": round(value, 6)}
+                    row |= {"before": round(before, 6)}
                     row |= {"spread": float(f"{cells[key]['spread']:.6g}")}
                     row |= {"observed": round(cells[key]["greedy"], 6), "seeds": int(cells[key]["seeds"])}
                     writer.writerow({"study": block, **cell, **row})
                     file.flush()
 
 
-def regret_of(run, cell, told):
-    """The primary predictor of a cell, and its number of states."""
-    known = {**cell, **(told or {})}
-    name = primary_predictors()[run.config["agent"]]
+def regret_of(run, known, name):
+    """A predictor of a cell, from known columns or computed, and its number of states."""
     if name in known:
         return float(known[name]), known["num_states"]
     task = RunConfig.from_dict(run.config).task(trust=True, strict=True)
-    return primary_regret(run.config, task).value, task.mdp.num_states
+    measure = agent_called(run.config["agent"]).idealised.fallback if name in BEFORE.values() else None
+    return primary_regret(run.config, task, measure=measure).value, task.mdp.num_states
 
 
-def judge(file, resamples):
+def before(file):
+    """Cells with what the predictors of before said of them."""
     frame = pd.read_csv(file)
+    return frame.assign(predicted=frame["before"])
+
+
+def judge(frame, resamples):
     one, two, three = (frame["study"] == name for name in ("sealed-1", "sealed-2", "sealed-3"))
     for agent in primary_predictors():
         for name, chosen in (
@@ -254,25 +268,26 @@ def criteria(resamples):
     tested, rows = frame[frame["part"].str[0].isin([*"abc"])], []
     for agent, (least, end, rank, share) in ASKED.items():
         name, width = next(iter(NAMED[agent].items()))
-        cells = tested[tested["agent"] == agent]
-        fields = row_of(cells, "abc", name, width, resamples).strip("| ").split(" | ")
-        r_squared, low = (float(each) for each in re.findall(r"-?[0-9.]+", fields[4])[:2])
-        classes = np.unique(cells["environment"], return_inverse=True)[1]
-        once = np.ones((1, classes.max() + 1), int)
-        held_rank = float(held_out(cells[[name]].to_numpy(), cells["greedy"].to_numpy(), classes, once)[1][0])
-        pairs, inside = float(fields[6].split()[0]), float(fields[8].split()[0])
-        for words, limit, found in (
-            ("R²", least, r_squared),
-            ("its lower end", end, low),
-            ("rank correlation of held-out predictions", rank, round(held_rank, 2)),
-            ("pairs of observations in order", share, pairs),
-        ):
-            rows.append((agent, words, f"> {limit}", found, found > limit))
-        asked = f"{SHARE_HELD[0]} to {SHARE_HELD[1]}"
-        rows.append(
-            (agent, f"the interval of ± {width} holds", asked, inside, SHARE_HELD[0] <= inside <= SHARE_HELD[1])
-        )
+        asked = least, end, rank, share
+        found = verdicts(tested[tested["agent"] == agent], name, "greedy", width, asked, resamples)
+        rows += [(agent, *row) for row in found]
     return rows
+
+
+def verdicts(cells, name, observed, width, asked, resamples):
+    """Rows of the criteria of a test: (criterion, asked for, found, whether it held)."""
+    fields = row_of(cells.rename(columns={observed: "greedy"}), "abc", name, width, resamples)
+    fields = fields.strip("| ").split(" | ")
+    r_squared, low = (float(each) for each in re.findall(r"-?[0-9.]+", fields[4])[:2])
+    classes = np.unique(cells["environment"], return_inverse=True)[1]
+    once = np.ones((1, classes.max() + 1), int)
+    held_rank = float(held_out(cells[[name]].to_numpy(), cells[observed].to_numpy(), classes, once)[1][0])
+    pairs, inside = float(fields[6].split()[0]), float(fields[8].split()[0])
+    found = r_squared, low, round(held_rank, 2), pairs
+    words = "R²", "its lower end", "rank correlation of held-out predictions", "pairs of observations in order"
+    rows = [(word, f"> {limit}", value, value > limit) for word, limit, value in zip(words, asked, found, strict=True)]
+    span = f"{SHARE_HELD[0]} to {SHARE_HELD[1]}"
+    return [*rows, (f"the interval of ± {width} holds", span, inside, SHARE_HELD[0] <= inside <= SHARE_HELD[1])]
 
 
 def third(resamples):
@@ -305,7 +320,7 @@ def third(resamples):
 
 def beside(file, resamples):
     """DQN's predictor beside `sampled_regret`: R2 of classes left out of both, and the difference."""
-    frame, key = pd.read_csv(file), ["study", *CELL, "steps"]
+    frame, key = before(file), ["study", *CELL, "steps"]
     frame = frame.merge(pd.read_csv(STUDIES / "sealed-3" / "sampled.csv"), on=key)
     is_sealed = frame["study"].str.startswith("sealed")
     rng = np.random.default_rng(0)
@@ -326,9 +341,104 @@ def beside(file, resamples):
         print(f"| {len(cells)}, {words} | {number} | {one[0]:.2f} | {other[0]:.2f} | {difference} |")
 
 
-def units(file):
+OTHER = STUDIES / "other-classes"
+OTHER_WIDTHS = {"dqn": 0.14, "ppo": 0.08}
+"""Half-widths of the intervals that its design names."""
+OTHER_ASKED = 0.75, 0.5, 0.85, 0.82
+
+
+def other_cells():
+    """Cells of the ten other classes: what was predicted, and the regret of the packed runs."""
+    frame, _ = study.read_predictions(OTHER / "predictions.parquet")
+    runs = sorted(OTHER.glob("runs-*.parquet"))
+    observed = pd.concat([cells_of(OTHER / "study.yaml", each) for each in runs]).rename(columns={"greedy": "observed"})
+    cells = frame.merge(observed[[*CELL, "observed", "seeds", "spread"]], on=CELL).rename(
+        columns={"num_states": "states"}
+    )
+    columns = [cells[name].where(cells["agent"] == agent, 0.0) for agent, name in primary_predictors().items()]
+    return cells.assign(study="other-classes", steps=30_000, predicted=sum(columns))
+
+
+def other(resamples):
+    """The test on ten other classes: criteria and verdicts, then the row of each agent, then the misses."""
+    frame = other_cells()
+    for agent, width in OTHER_WIDTHS.items():
+        cells = frame[frame["agent"] == agent]
+        for words, limit, found, held in verdicts(cells, "predicted", "observed", width, OTHER_ASKED, resamples):
+            print(f"| {agent.upper()} | {words} | {limit} | {found:.2f} | {'held' if held else 'failed'} |")
+    for agent in OTHER_WIDTHS:
+        cells = frame[frame["agent"] == agent]
+        print(f"| {agent.upper()} | {len(cells)} | {said_of(cells, resamples)} |")
+    for agent in OTHER_WIDTHS:
+        cells = frame[frame["agent"] == agent]
+        misses = (cells["observed"] - cells["predicted"]).groupby(cells["environment"]).mean().sort_values()
+        print(f"| {agent.upper()} | {', '.join(f'{key} {miss:+.2f}' for key, miss in misses.items())} |")
+
+
+PARTS = {
+    "all parts": {},
+    "kernels that stay as they are": {"grows": False},
+    "every parameter's gradient alike": {"even": True},
+    "neither": {"grows": False, "even": True},
+}
+
+
+def ablations(file, resamples):
+    """Primary predictors without one of their parts, on the vectors and hashes of two sealed sets."""
+    done = pd.read_csv(file) if file != CELLS_FILE and file.exists() else None
+    if done is None:
+        rows = []
+        for block in ("sealed-2", "sealed-3"):
+            cells = observed_of(block, BLOCKS[block][0], None)
+            for run in study.specification(BLOCKS[block][0], trust=True).runs:
+                key = tuple(run.cell.values())
+                if key not in cells or run.config["seed"] or run.config["observation"] not in ("vector", "hash"):
+                    continue
+                task = RunConfig.from_dict(run.config).task(trust=True, strict=True)
+                row = {"study": block, **run.cell, "agent": run.config["agent"], "steps": run.config["steps"]}
+                row |= {"states": task.mdp.num_states, "spread": cells[key]["spread"], "observed": cells[key]["greedy"]}
+                for words, left_out in PARTS.items():
+                    with without(**left_out):
+                        row[words] = primary_regret(run.config, task).value
+                rows.append(row)
+                print(len(rows), *run.cell.values(), *(f"{row[words]:.2f}" for words in PARTS), flush=True)
+        done = pd.DataFrame(rows)
+        if file != CELLS_FILE:
+            done.to_csv(file, index=False, lineterminator="\n")
+    for agent in primary_predictors():
+        for words in PARTS:
+            cells = done[done["agent"] == agent]
+            said = said_of(cells.assign(predicted=cells[words]), resamples)
+            print(f"| {agent.upper()} | {words} | {len(cells)} | {said} |")
+
+
+@contextlib.contextmanager
+def without(grows=True, even=False):
+    """Idealised networks whose kernels stay as they are, or whose gradients are alike; nothing is kept."""
+    from pharos.hardness.representation import learning, network_regret
+
+    settle, report, made = network_regret.IdealisedNetwork.settle, hardness.report, learning.OutputLayer.__init__
+
+    def stay(network):
+        last, gram = network.net.last.copy(), network.net.gram.copy()
+        settle(network)
+        network.net.last[:], network.net.gram[:] = last, gram
+
+    def alike(layer, kernel, weights, parameters, evenness, largest=np.inf):
+        made(layer, kernel, weights, parameters, (1.0, 1.0), largest)
+
+    try:
+        hardness.report = functools.partial(report, keep=False)
+        network_regret.IdealisedNetwork.settle = settle if grows else stay
+        learning.OutputLayer.__init__ = alike if even else made
+        yield
+    finally:
+        network_regret.IdealisedNetwork.settle, hardness.report = settle, report
+        learning.OutputLayer.__init__ = made
+
+
+def units(frame):
     """Mean of observed less predicted regret by V* - U, classes weighing alike."""
-    frame = pd.read_csv(file)
     frame["miss"] = frame["observed"] - frame["predicted"]
     for low, high in itertools.pairwise(UNITS):
         part = frame[(frame["spread"] >= low) & (frame["spread"] < high)]
@@ -430,17 +540,16 @@ def pilots(file, write=False):
         print(f"| {agent.upper()} | {words} | {' | '.join(texts)} |")
 
 
-def draw(file, picture):
-    """Predicted against observed on the third sealed set, a panel for each agent."""
+def draw(frame, picture):
+    """Predicted against observed regret of cells, a panel for each agent."""
     from pharos.plots import save
     from pharos.plots.style import GRID_COLOR, LINE_COLORS, panels, styled
 
     @styled
     def by_agent():
-        frame = pd.read_csv(file)
         drawn, axes = panels(2, 3.4, 3.3)
         for axis, agent in zip(axes, primary_predictors(), strict=True):
-            cells = frame[(frame["agent"] == agent) & (frame["study"] == "sealed-3")]
+            cells = frame[frame["agent"] == agent]
             most = 1.05 * cells[["predicted", "observed"]].to_numpy().max()
             axis.plot([0, most], [0, most], color=GRID_COLOR, zorder=0)
             for number, (name, some) in enumerate(cells.groupby(cells["observation"].str.split("[(,]").str[0])):
@@ -520,7 +629,11 @@ def statistics(known, counts):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "task", choices=("compute", "judge", "orders", "held", "sealed", "collect", "third", "pilots", "draw", "cost")
+        "task",
+        choices=(
+            *("compute", "judge", "orders", "held", "sealed", "collect", "third", "pilots", "draw", "cost"),
+            *("other", "ablations"),
+        ),
     )
     parser.add_argument("--out", type=Path, default=CELLS_FILE)
     parser.add_argument("--cells", type=Path, default=CELLS_FILE)
@@ -532,7 +645,8 @@ def main():
     if arguments.task == "compute":
         compute(arguments.out, arguments.block or [*BLOCKS])
     elif arguments.task == "judge":
-        judge(arguments.cells, arguments.resamples)
+        judge(pd.read_csv(arguments.cells), arguments.resamples)
+        judge(before(arguments.cells), arguments.resamples)
     elif arguments.task == "orders":
         orders(arguments.cells)
     elif arguments.task == "held":
@@ -545,13 +659,19 @@ def main():
     elif arguments.task == "third":
         third(arguments.resamples)
         beside(arguments.cells, arguments.resamples)
-        units(arguments.cells)
+        units(before(arguments.cells))
     elif arguments.task == "pilots":
         pilots(arguments.cells, arguments.write)
     elif arguments.task == "cost":
         cost()
+    elif arguments.task == "other":
+        other(arguments.resamples)
+        draw(other_cells(), STUDIES.parent / "images" / "other-classes.png")
+    elif arguments.task == "ablations":
+        ablations(arguments.cells, arguments.resamples)
     else:
-        draw(arguments.cells, arguments.picture)
+        frame = before(arguments.cells)
+        draw(frame[frame["study"] == "sealed-3"], arguments.picture)
 
 
 if __name__ == "__main__":

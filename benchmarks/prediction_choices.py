@@ -3,6 +3,7 @@
     python benchmarks/prediction_choices.py predict     # writes predictions.csv; commit it before the next one
     python benchmarks/prediction_choices.py run         # writes runs.csv; goes on where it was stopped
     python benchmarks/prediction_choices.py judge
+    python benchmarks/prediction_choices.py predict|judge --predictions predictions-network.csv    # another predictor's
 
 Six worlds, instances of classes that pharos has, none of them in the published studies; DQN and PPO, 30 thousand steps,
 five seeds, the regret of the learnt policies as a mean over 30 evaluations. Hyperparameters: 20 settings of each agent,
@@ -161,9 +162,9 @@ def scores(said, seen):
     return rank, right.sum(), clear.sum(), *lost, of_four, seen.mean()
 
 
-def judge():
+def judge(predictions="predictions.csv"):
     """Print a table of each kind and agent."""
-    told, runs = read("predictions.csv"), read("runs.csv")
+    told, runs = read(predictions), read("runs.csv")
     groups = {}
     for cell in cells():
         if cell in told and cell in runs:
@@ -201,15 +202,17 @@ def judge():
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=("predict", "run", "judge"))
-    what = parser.parse_args().what
+    parser.add_argument("--predictions", default="predictions.csv", help="a file of docs/studies/choices")
+    arguments = parser.parse_args()
+    what = arguments.what
     if what == "predict":
-        fill("predictions.csv", ("predicted", "deviation", "tabular"), predicted)
+        fill(arguments.predictions, ("predicted", "deviation", "tabular"), predicted)
     elif what == "run":
         if set(read("predictions.csv")) < set(cells()):
             raise SystemExit("predictions.csv lacks cells: `predict` comes first")
         fill("runs.csv", ("observed", "deviation"), observed)
     else:
-        judge()
+        judge(arguments.predictions)
 
 
 if __name__ == "__main__":

@@ -68,7 +68,7 @@ def test_a_pilot_and_the_prediction_are_put_together():
     assert cell.pilot == so_far and math.isnan(measure.pilot)
     assert cell.value == plane("ppo", 0.5).value(so_far, measure.value)
     assert both.half_width == plane("ppo", 0.5).calibration.half_width() and not both.orders
-    assert both.predictor == "clipped_regret_evaluated and a pilot of 2,560 steps"
+    assert both.predictor == "network_policy_regret and a pilot of 2,560 steps"
 
 
 def test_other_shares_and_networks_have_no_calibration():

@@ -13,6 +13,7 @@ from command_line import run
 from pharos import hardness, importers
 from pharos.agents import agent_called, primary_predictors
 from pharos.errors import ParameterError, UndefinedMeasure
+from pharos.hardness.representation import network_regret as network_regret_module
 from pharos.observations import representation
 from pharos.prediction import Published, prediction, published
 from pharos.prediction.calibration import COMMON, OrderCounts
@@ -163,18 +164,16 @@ def test_a_dqn_is_predicted_in_the_unit_that_it_is_paid_in():
     assert len({plain, by_number, by_range}) == 3
 
 
-def test_a_unit_in_which_a_ppo_was_worse_than_predicted_is_named():
-    known = published("ppo")
-    idealised = agent_called("ppo").idealised
-    missed = [known.observed - known.predicted, known.spreads >= idealised.large_unit]
-    means = [
-        np.mean([missed[0][(known.classes == name) & where].mean() for name in np.unique(known.classes[where])])
-        for where in (missed[1], ~missed[1])
-    ]
-    assert [f"{mean:.2f}" for mean in means] == [str(idealised.large_unit_miss), "0.09"]
-    for agent, spread, is_said in (("ppo", 50.0, True), ("ppo", 49.9, False), ("dqn", 1000.0, False)):
-        lines = list(prediction._large_unit(agent, spread))
-        assert len(lines) == is_said and all("worse than predicted by 0.16" in line for line in lines)
+@pytest.mark.slow
+def test_another_measure_stands_in_for_unknown_networks_and_many_observations(monkeypatch):
+    world = {"length": 5, "steps": 3000, "common": True}
+    assert not any("predicted by" in line for line in pharos.predict("river_swim", **world).warnings)
+    monkeypatch.setattr(network_regret_module, "MOST_OBSERVATIONS", 4)
+    for agent, name in (("dqn", "huber_regret"), ("ppo", "kernel_policy_regret")):
+        answer = pharos.predict("river_swim", agent=agent, **world)
+        assert answer.cells[0].measure == name != answer.predictor == primary_predictors()[agent]
+        (line,) = (line for line in answer.warnings if "predicted by" in line)
+        assert f"predicted by {name}, as {answer.predictor} is for at most" in line
 
 
 def test_agents_without_published_runs_are_refused():
@@ -189,18 +188,21 @@ def test_a_dqn_is_predicted_by_the_learner_with_its_loss_and_schedule():
     schedule = hardness.Schedule(
         steps=1000, learning_starts=100, period=100, gradient_steps=25, gamma=0.99, exploration_fraction=0.5
     )
+    rate = agent_called("dqn").defaults["learning_rate"]
     for cell, options in zip(
         answer.cells, ({"observation": "vector"}, {"observation": "hash", "bits": 8}), strict=True
     ):
         mdp = pharos.sticky_actions(space.mdp(gamma=1.0).with_horizon(space.environment.max_episode_steps), 0.1)
-        expected = hardness.huber_regret(
+        expected = hardness.network_regret(
             mdp,
             representation(space, **options),
             schedule=schedule,
             sampling=hardness.Sampling(batch_size=8, buffer_size=50_000),
+            adam=hardness.Adam(learning_rate=rate, max_grad_norm=10.0),
         )
         assert cell.value == expected.value
-        assert cell.tabular == expected.tabular.mean
+        assert cell.tabular == expected.tabular
+        assert cell.measure == "network_regret"
         assert (cell.low, cell.high) == (max(0.0, cell.value - answer.half_width), cell.value + answer.half_width)
         entry = cell.to_dict()
         assert (cell.lower, cell.upper) == (cell.low, cell.high) == (entry["lower"], entry["upper"])
@@ -209,25 +211,41 @@ def test_a_dqn_is_predicted_by_the_learner_with_its_loss_and_schedule():
         assert cell.local_coverage == published("dqn").coverage(near=cell.value) and cell.local_cells > 70
     assert answer.half_width == published("dqn").half_width()
     assert [cell.observation for cell in answer.cells] == ["vector", "hash(bits=8)"]
-    assert answer.predictor == "huber_regret" and answer.states == 5
+    assert answer.predictor == "network_regret" and answer.states == 5
     assert any("sticky" in warning for warning in answer.warnings)
     assert any("1,000 steps" in warning for warning in answer.warnings)
     assert any("learning_starts, batch_size" in warning for warning in answer.warnings)
 
 
 @pytest.mark.long
-def test_a_ppo_is_predicted_as_it_is_evaluated():
-    answer = pharos.predict("river_swim", agent="ppo", steps=2048, length=5)
+def test_a_ppo_is_predicted_with_its_rollouts_and_steps():
+    answer = pharos.predict("river_swim", agent="ppo", steps=2048, length=5, hyperparameters={"n_epochs": 3})
     space = pharos.build(pharos.make("river_swim", length=5))
-    expected = hardness.kernel_policy_regret(
+    settings = pharos.agents.hyperparameters("ppo", "river_swim", "vector", {"n_epochs": 3})
+    expected = hardness.network_policy_regret(
         space.mdp(gamma=1.0).with_horizon(space.environment.max_episode_steps),
         representation(space, "vector", "mlp128x2+tanh", initialisation="sb3"),
         schedule=hardness.Schedule(steps=2048, gamma=0.99),
-        rollouts=hardness.Rollouts(steps=512, gradient_steps=16, gae_lambda=0.95, clip_range=0.2),
+        rollouts=hardness.Rollouts(
+            steps=512, gradient_steps=12, clip_range=0.2, environments=8, epochs=3, entropy_weight=0.01
+        ),
+        adam=hardness.Adam(learning_rate=settings["learning_rate"], max_grad_norm=0.5, epsilon=1e-5),
     )
-    assert answer.cells[0].value == pytest.approx(expected.curve.mean_evaluated, abs=1e-6)  # kept curves have 6 digits
+    assert answer.cells[0].value == expected.value
+    assert answer.cells[0].tabular == expected.tabular
     assert answer.cells[0].network == "mlp128x2+tanh"
-    assert np.isnan(answer.cells[0].deviation)
+    assert answer.cells[0].deviation == expected.curve.deviation
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("agent", primary_predictors())
+def test_the_learning_rate_and_the_unit_of_rewards_are_known(agent):
+    world = {"agent": agent, "length": 5, "steps": 2048}
+    values = [
+        pharos.predict("river_swim", **world, **options).cells[0].value
+        for options in ({}, {"hyperparameters": {"learning_rate": 1e-7}}, {"scale_rewards": "range"})
+    ]
+    assert len({*values}) == 3
 
 
 @pytest.mark.slow

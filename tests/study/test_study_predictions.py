@@ -10,7 +10,14 @@ import pytest
 
 from command_line import run
 from pharos import hardness, study
-from pharos.agents import HUBER_PREDICTORS, POLICY_PREDICTORS, agent_called, hyperparameters
+from pharos.agents import (
+    NETWORK_CURVE,
+    NETWORK_POLICY_PREDICTORS,
+    NETWORK_PREDICTORS,
+    POLICY_PREDICTORS,
+    agent_called,
+    hyperparameters,
+)
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted
 from pharos.hardness import registry
 from pharos.prediction import PREDICTORS, learners
@@ -56,14 +63,14 @@ def test_every_cell_that_sees_observations_is_predicted(predicted):
 def test_the_primary_predictor_alone_is_what_it_is_beside_the_others(predicted, tmp_path):
     alone = study.predict(SPEC, tmp_path, primary=True)
     is_ppo = predicted["agent"] == "ppo"
-    of_ppo = ["clipped_regret", "clipped_regret_evaluated", "clipped_tabular_regret", "clipped_curve"]
-    for rows, names in ((is_ppo, of_ppo), (~is_ppo, [*HUBER_PREDICTORS])):
+    for rows, names in ((is_ppo, [*NETWORK_POLICY_PREDICTORS, NETWORK_CURVE]), (~is_ppo, [*NETWORK_PREDICTORS])):
         both = ["instance", "agent", "observation", "network", "num_states", *names]
         pd.testing.assert_frame_equal(alone.loc[rows, both], predicted.loc[rows, both])
         assert alone.loc[rows, names].notna().all().all()
-    assert alone[[*PREDICTORS[:-1], "policy_regret"]].isna().all().all()
+    assert alone[[*PREDICTORS[:-1], "policy_regret", "huber_regret", "clipped_regret_evaluated"]].isna().all().all()
     assert alone["estimated_error"].tolist() == [0.0] * 4  # small kernels are exact
-    assert alone["notes"].str.contains("huber_regret: a mean over 3 walks").tolist() == [True, True, False, False]
+    assert alone["notes"].str.contains("^network_regret: a mean over 3 walks").tolist() == [True, True, False, False]
+    assert alone["notes"].str.contains("^network_policy_regret: a mean over 3").tolist() == [False, False, True, True]
 
 
 def test_the_primary_predictor_of_an_agent_that_has_none_is_a_note(tmp_path):
@@ -86,15 +93,17 @@ def test_an_actor_critic_is_idealised_with_the_rollouts_and_the_lambda_of_its_ag
 
     def report(mdp, names, **options):
         rollouts.append(options["rollouts"])
-        return {names[0]: SimpleNamespace(value=None)}
+        return {names[0]: SimpleNamespace(name=names[0], value=None)}
 
     monkeypatch.setattr(hardness, "report", report)
     for agent in ("ppo", "a2c"):  # A2C of Stable-Baselines3 has a lambda of 1
         own = hyperparameters(agent, "simple_grid", "vector")
-        agent_called(agent).idealised.columns({"agent": agent, "steps": 1000, "hyperparameters": own}, None, {})
+        config = {"agent": agent, "steps": 1000, "hyperparameters": own}
+        seen = {"representation": hardness.Representation.of_matrix([[1.0]])}  # of no known output layer
+        agent_called(agent).idealised.columns(config, None, seen)
     assert rollouts == [
         hardness.Rollouts(steps=512, gradient_steps=16, gae_lambda=0.95),
-        hardness.Rollouts(steps=512, gradient_steps=16, gae_lambda=0.95, clip_range=0.2),  # as A2C has not
+        *[hardness.Rollouts(steps=512, gradient_steps=16, gae_lambda=0.95, clip_range=0.2)] * 2,  # as A2C has not
         hardness.Rollouts(steps=40, gradient_steps=1, gae_lambda=1.0),
     ]
 

@@ -46,6 +46,7 @@ class Idealised:
         predictor: the column that stands for the agent, named before the runs of a sealed test. Empty if there is none.
         initialisation: of the network, see `pharos.observations.representation`.
         suffix: of the network's name.
+        earlier: columns of earlier predictors, NaN where the predictor alone is computed.
         fallback: the measure in its place for a network whose output layer is not known, and for more different
             observations than it is for.
     """
@@ -55,6 +56,7 @@ class Idealised:
     initialisation: str = "sb3"
     suffix: str = "+tanh"
     fallback: str = ""
+    earlier: tuple[str, ...] = ()
 
     def schedule(self, config: Configuration) -> "Schedule":
         """The schedule of the agent."""
@@ -101,6 +103,7 @@ class IdealisedDQN(Idealised):
     kind: str = "dqn"
     predictor: str = "network_regret"
     fallback: str = "huber_regret"
+    earlier: tuple[str, ...] = HUBER_PREDICTORS
     initialisation: str = "pytorch"
     suffix: str = ""
 
@@ -152,6 +155,7 @@ class IdealisedActorCritic(Idealised):
     """
 
     kind: str = "ppo"
+    earlier: tuple[str, ...] = POLICY_PREDICTORS
     gae_lambda: float = 0.95
     clip_range: float | None = None
 

@@ -92,7 +92,8 @@ def _of_primary(config: Mapping[str, Any], mdp: "TabularMDP", options: Mapping[s
     result = idealised.primary(config, mdp, options)
     error = math.nan if result.value is None else result.value["estimated_error"]
     notes = result.undefined or result.certificate.note or ""
-    return {**idealised.primary_columns(result.name, result.value), "estimated_error": error, "notes": notes}
+    row = dict.fromkeys(idealised.earlier, math.nan) | idealised.primary_columns(result.name, result.value)
+    return {**row, "estimated_error": error, "notes": notes}
 
 
 def _idealised(config: Mapping[str, Any]) -> "Idealised":
@@ -147,12 +148,14 @@ def primary_regret(
     task: "Task",
     network: Network | None = None,
     landmarks: int | None = None,
+    measure: str | None = None,
 ) -> PrimaryRegret:
     """Return the regret of a run's idealised learner, and the name of the network.
 
     Args:
         config: of the run. task: its task.
         network: as `pharos.observations.representation` takes it. Default: the agent's own, with its `net_arch`.
+        measure: another one of the idealised learner. Default: its predictor, or the one that stands in for it.
     Raises:
         ParameterError: the agent has no such learner, the network does not fit, or the kernel is too large.
         UndefinedMeasure: no policy beats uniform play.
@@ -168,7 +171,11 @@ def primary_regret(
         _options(task, name, initialisation, landmarks),
         {**config, "chance": task.scaled_chance.to_dict()},
     )
-    result = idealised.primary(config, task.mdp, options)
+    result = (
+        idealised.primary(config, task.mdp, options)
+        if measure is None
+        else idealised.result(measure, config, task.mdp, options)
+    )
     value = result.value
     if value is None:
         raise UndefinedMeasure(result.undefined or f"{result.name} is undefined")
