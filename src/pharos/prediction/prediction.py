@@ -29,9 +29,9 @@ TAKEN = {
     "horizon",
     "hyperparameters",
 }  # of TrainingOptions
-NETWORKS_IN_ORDER = OrderCounts(pairs=16, right=3, clear_pairs=16, clear_right=3)
+NETWORKS_IN_ORDER = OrderCounts(pairs=16, right=10, clear_pairs=16, clear_right=10)
 """Pairs of a DQN's networks, three widths and depths behind each of ten observations, whose regrets differ:
-benchmarks/prediction_choices.py. What a wider network gains its kernel does not see.
+benchmarks/prediction_choices.py.
 """
 LEAST_RIGHT = 0.75
 """Share of published pairs below which an order is not called."""
@@ -108,8 +108,8 @@ class PairOrder:
         counts, (easier, harder) = self.counts, (self.easier, self.harder)
         if self.of_networks:
             return (
-                f"{easier} or {harder}: not to be called, as predictions do not order networks (right in "
-                f"{counts.clear_right} of {counts.clear_pairs} pairs)"
+                f"{easier} or {harder}: not to be called, as predictions ordered networks rightly in "
+                f"{counts.clear_right} of {counts.clear_pairs} pairs only"
             )
         if self.is_called:
             return (
