@@ -8,9 +8,20 @@ import pytest
 from gymnasium import spaces
 
 import pharos
-from pharos.errors import ParameterError, UnknownName
-from pharos.hardness import Network, default_network, empirical_ntk, kernel_of_module, tangent_kernel
-from pharos.observations import network_inputs, ntk, observe
+from pharos.errors import ParameterError, UndefinedMeasure, UnknownName
+from pharos.hardness import (
+    Network,
+    OutputLayer,
+    Schedule,
+    default_network,
+    empirical_ntk,
+    kernel_of_module,
+    network_policy_regret,
+    network_regret,
+    tangent_kernel,
+)
+from pharos.hardness.representation.network_regret import IdealisedNetwork
+from pharos.observations import network_inputs, ntk, observe, representation
 from refusals import refusal
 
 RNG = np.random.default_rng(0)
@@ -184,6 +195,144 @@ def test_inputs_are_those_of_stable_baselines(grid):
             space = spaces.Box(0, 255, values.shape[1:], np.uint8)
         expected = preprocess_obs(torch.as_tensor(values), space).numpy()
         np.testing.assert_array_equal(network_inputs(seen, grid.states()), expected)
+
+
+def layers_of_64(shape, *after, bias=True):
+    """`mlp64x2` with four outputs, as PyTorch initialises it."""
+    from torch import nn
+
+    hidden = nn.Linear(shape[0], 64), nn.ReLU(), nn.Linear(64, 64), nn.ReLU()
+    return nn.Sequential(*hidden, nn.Linear(64, 4, bias=bias), *after)
+
+
+def random_networks(make, shape):
+    """The 20 networks that the kernel of a function is a mean over."""
+    import torch
+
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        return [make(shape) for _ in range(20)]
+
+
+@pytest.mark.parametrize("bias", [True, False])
+def test_the_output_layer_of_a_function_is_the_mean_over_its_networks(bias):
+    """By hidden units and gradients of each input alone, of the same networks."""
+    import torch
+
+    def make(shape):
+        return layers_of_64(shape, bias=bias)
+
+    layer = kernel_of_module(make, (5,))[0].output_layer(VECTORS)
+    products, weights, evenness = [], [], []
+    for network in random_networks(make, (5,)):
+        hidden = network[:-1](torch.as_tensor(VECTORS)).detach().numpy()
+        products.append(hidden @ hidden.T + bias)
+        weights.append(float((network[-1].weight[0].detach() ** 2).sum()))
+        gradients = []
+        for x in torch.as_tensor(VECTORS):
+            network.zero_grad()
+            network(x[None])[0, 0].backward()
+            output = [each.grad[0].flatten() for each in network[-1].parameters()]
+            beneath = [each.grad.flatten() for each in network[:-1].parameters()]
+            gradients.append([torch.cat(output).numpy(), torch.cat(beneath).numpy()])
+        sizes = [np.sqrt((np.stack(group) ** 2).mean(axis=0)) for group in zip(*gradients, strict=True)]
+        evenness.append([size.mean() / np.sqrt((size**2).mean()) for size in sizes])
+    np.testing.assert_allclose(layer.kernel(VECTORS, VECTORS), np.mean(products, axis=0), rtol=1e-5)
+    np.testing.assert_allclose(layer.kernel(VECTORS[:2], VECTORS[2:]), np.mean(products, axis=0)[:2, 2:], rtol=1e-5)
+    assert layer.weights == pytest.approx(np.mean(weights), rel=1e-6)
+    assert layer.evenness == pytest.approx(np.mean(evenness, axis=0), rel=1e-5)
+    assert (layer.parameters, layer.has_bias) == ((64 + bias, 64 * 6 + 64 * 65), bias)
+
+
+def test_the_output_layer_of_a_function_is_near_the_closed_form(grid):
+    own, named = (representation(grid, "vector", network) for network in (layers_of_64, "mlp64x2"))
+    states = np.arange(grid.num_states)
+    found, expected = (each.output_layer.kernel(states, states) for each in (own, named))
+    np.testing.assert_allclose(found, expected, rtol=0.1)
+    assert own.output_layer.parameters == named.output_layer.parameters
+    assert own.output_layer.weights == pytest.approx(named.output_layer.weights, rel=0.1)
+
+
+def test_a_network_that_ends_otherwise_has_no_output_layer():
+    from torch import nn
+
+    class Dueling(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.hidden, self.value, self.advantages = nn.Linear(5, 16), nn.Linear(16, 1), nn.Linear(16, 4)
+
+        def forward(self, x):
+            hidden = self.hidden(x).relu()
+            advantages = self.advantages(hidden)
+            return self.value(hidden) + advantages - advantages.mean(dim=1, keepdim=True)
+
+    def output_layer(make):
+        return kernel_of_module(make, (5,))[0].output_layer(VECTORS)
+
+    assert output_layer(lambda shape: layers_of_64(shape, nn.Tanh())) is None
+    assert output_layer(lambda shape: layers_of_64(shape, nn.LayerNorm(4))) is None
+    assert output_layer(lambda _: Dueling()) is None
+    assert output_layer(lambda shape: layers_of_64(shape, nn.Flatten())).parameters == (65, 64 * 6 + 64 * 65)
+
+
+def test_errors_of_an_output_layer_name_the_network():
+    from torch import nn
+
+    def large(shape):
+        made = layers_of_64(shape)
+        nn.init.constant_(made[0].weight, 1e25)  # whose square is infinite
+        return made
+
+    for make, words in (
+        (large, "large' on inputs of shape (5,): gradients of the network are not finite"),
+        (lambda _: nn.Linear(4, 2), "on inputs of shape (5,): RuntimeError: "),
+        (lambda _: 3, "on inputs of shape (5,): make returned 3; expected a torch.nn.Module"),
+    ):
+        assert words in refusal(ParameterError, kernel_of_module(make, (5,))[0].output_layer, VECTORS)
+
+
+def test_regret_in_a_network_of_a_function_is_near_the_regret_of_its_name(grid):
+    """Means over 3 walks, one of which deviates by about 0.25 (DQN) and 0.01 (PPO)."""
+    seen = [representation(grid, "vector", network) for network in (layers_of_64, "mlp64x2")]
+    for measure, tolerance in ((network_regret, 0.4), (network_policy_regret, 0.05)):
+        own, named = (measure(grid.mdp(), each, schedule=Schedule(steps=4000)) for each in seen)
+        assert own.diverged == named.diverged == 0
+        assert own.value == pytest.approx(named.value, abs=tolerance)
+
+
+def test_regret_in_a_network_that_ends_otherwise_is_undefined(grid):
+    from torch import nn
+
+    seen = representation(grid, "vector", lambda shape: layers_of_64(shape, nn.Tanh()))
+    assert seen.output_layer is None
+    assert "let it end with a torch.nn.Linear" in refusal(UndefinedMeasure, network_regret, grid.mdp(), seen)
+
+
+def test_a_linear_network_has_a_regret(grid):
+    from torch import nn
+
+    seen = representation(grid, "one_hot", lambda shape: nn.Linear(shape[0], 4))
+    assert seen.output_layer.parameters == (grid.environment.height + grid.environment.width + 1, 0)
+    found = network_policy_regret(grid.mdp(), seen, schedule=Schedule(steps=4000))
+    assert found.diverged == 0
+    assert found.curve.greedy.min() < 0.9  # it learns
+
+
+@pytest.mark.parametrize("has_bias", [True, False])
+def test_a_settled_network_has_the_products_of_its_weights(has_bias):
+    """Output weights that moved along features, with and without a bias."""
+    rng = np.random.default_rng(0)
+    features, weights, moved = rng.normal(size=(3, 8)), rng.normal(size=(2, 8)), rng.normal(size=(2, 3))
+    last = (features @ features.T + has_bias).astype(np.float32)
+    layer = OutputLayer(lambda x, y: last, 1.0, (8 + has_bias, 0), (1.0, 0.0), has_bias=has_bias)
+    network = IdealisedNetwork(last.copy(), np.zeros_like(last), 1.0, weights @ features.T, None, layer)
+    network.net.gram[:] = weights @ weights.T
+    network.net.weights[:] = moved
+    network.net.outputs[:] += moved @ last
+    network.settle()
+    after = weights + moved @ features
+    np.testing.assert_allclose(network.net.gram, after @ after.T, rtol=1e-4)
+    np.testing.assert_allclose(network.net.outputs - network.bias, after @ features.T, rtol=1e-4, atol=1e-5)
 
 
 def test_what_has_no_kernel_says_so_in_a_line(grid, monkeypatch):

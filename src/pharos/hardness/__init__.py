@@ -66,7 +66,7 @@ from pharos.system import lazy
 
 if TYPE_CHECKING:
     from pharos.hardness.representation.aliasing import Aliasing, aliasing_of_classes
-    from pharos.hardness.representation.empirical import empirical_ntk, kernel_of_module
+    from pharos.hardness.representation.empirical import ModuleKernel, empirical_ntk, kernel_of_module
     from pharos.hardness.representation.memoryless import MemorylessLoss, memoryless_loss
     from pharos.hardness.representation.networks import (
         Network,

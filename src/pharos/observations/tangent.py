@@ -11,6 +11,7 @@ import numpy as np
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError
 from pharos.hardness import (
+    ModuleKernel,
     Network,
     OutputLayer,
     Representation,
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from pharos.state_space import StateSpace
 
 DIGEST_STATES = 4096  # states whose observations the digest is of
+EVENNESS_STATES = 64  # of different observations, over which the evenness of gradients is measured
 
 
 def network_inputs(observation: Observation, states: np.ndarray) -> np.ndarray:
@@ -125,13 +127,15 @@ def representation(
         observation, options: as for `observe`.
         network, initialisation: as for `ntk`. Or a network of one's own, a function of the shape of an input that
             returns a torch.nn.Module, or its name, "file.py:function" or "module:function": its kernel is the mean over
-            20 random ones, see `empirical_ntk`. Initialisation is the function's.
+            20 random ones, see `empirical_ntk`. So is its output layer, if its outputs are a torch.nn.Linear's.
+            Initialisation is the function's.
         landmarks: of the approximation of the kernel, at least 2. Default: if there are more than 4,096 different
             observations. 0: never.
     Raises:
         ParameterError: the environment's class is not known, the network has no closed form or does not fit the
             observation, the observation has no space that networks take, or landmarks is no number of them.
-    Cost: one observation of each state now, the kernel when a measure asks for it.
+    Cost: one observation of each state now, the kernel when a measure asks for it. For a network of one's own, also
+        gradients of 20 networks at up to 64 different observations now, as for their kernel.
     """
     if space.environment is None:
         raise ParameterError(f"{space}: the class of its environment is not known, so nothing is seen of its states")
@@ -139,9 +143,12 @@ def representation(
         landmarks = whole_number(landmarks, "landmarks", "a whole number, 0 for none, or None", least=0)
     observer = observe(space.environment, observation, state_space=space, **options)
     first = network_inputs(observer, space.states(slice(0, 1)))
+    of_module: ModuleKernel | None = None
+    layers: OutputLayer | None = None
+    tangent: Callable[..., np.ndarray]
     if callable(network) or sources.is_reference(network):
-        tangent, named = kernel_of_module(network, first.shape[1:])
-        layers = None
+        of_module, named = kernel_of_module(network, first.shape[1:])
+        tangent = of_module
     else:
         net = Network.of(default_network(observer.space) if network is None else network, initialisation)
         tangent, named = partial(tangent_kernel, net), {"network": net.name, "initialisation": net.initialisation}
@@ -158,9 +165,13 @@ def representation(
         same = rows is columns
         return function(inputs(rows), None if same else inputs(columns))
 
+    classes = observation_classes(space, observer)
+    if of_module is not None:
+        different = np.sort(np.unique(classes, return_index=True)[1])
+        layers = of_module.output_layer(inputs(different[:EVENNESS_STATES]))
     return Representation(
         kernel=partial(pairs, tangent),
-        classes=observation_classes(space, observer),
+        classes=classes,
         time_limit=int(space.environment.max_episode_steps),
         landmarks=landmarks,
         conventions={

@@ -31,11 +31,15 @@ class OutputLayer:
 
     Attributes:
         kernel: as of `Representation`, of the parameters of one output alone: h(x) . h(y) + 1, h the last hidden units.
+            Without the 1 if there is no bias.
         weights: expected sum of the squared weights of an output before training, bias aside.
         parameters: numbers of parameters: of one output, and of all layers beneath.
         evenness: of the output layer and of the layers beneath: the mean size of a parameter's gradient as a share of
-            its root mean square. Adam moves each parameter alike, so that 1 is where all have the same gradient.
+            its root mean square. Adam moves each parameter alike, so that 1 is where all have the same gradient. For
+            named networks the closed form is of one observation. For a network of one's own, sizes are root mean
+            squares over up to 64 different observations.
         largest: of h(x) . h(x) + 1. Infinite for ReLUs.
+        has_bias: whether an output has a bias.
     """
 
     kernel: Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -43,6 +47,7 @@ class OutputLayer:
     parameters: tuple[int, int]
     evenness: tuple[float, float]
     largest: float = math.inf
+    has_bias: bool = True
 
 
 @dataclass(frozen=True, eq=False)

@@ -209,7 +209,7 @@ class NetworkLearner(SampledLearner):
         if layer is None:
             raise UndefinedMeasure(
                 f"{self.measure} needs a network whose output layer is known: take a representation of "
-                "pharos.observations"
+                "pharos.observations, and if the network is a function's, let it end with a torch.nn.Linear"
             )
         if count > MOST_OBSERVATIONS:
             raise UndefinedMeasure(
@@ -260,10 +260,11 @@ class NetworkLearner(SampledLearner):
         size = self.whole.num_actions if outputs is None else outputs
         weights, adam, layer = share * self.layer.weights, self.adam, self.layer
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
-        start = np.sqrt(weights / max(layer.parameters[0] - 1, 1)) * (
+        start = np.sqrt(weights / max(layer.parameters[0] - layer.has_bias, 1)) * (
             rng.standard_normal((size, len(self.root))) @ self.root
         )
-        numbers = (float(layer.parameters[0] * size), float(layer.parameters[1]), *map(float, layer.evenness))
+        beneath = max(layer.parameters[1], 1)  # a linear network has none
+        numbers = (float(layer.parameters[0] * size), float(beneath), *map(float, layer.evenness))
         optimizer = (adam.learning_rate, adam.epsilon, adam.decay, adam.decay_of_squares, *numbers)
         return IdealisedNetwork(self.last.copy(), self.beneath, weights, start, (optimizer, adam.max_grad_norm), layer)
 
@@ -317,7 +318,7 @@ class IdealisedNetwork:
             is_live=np.zeros(count, np.bool_),
         )
         self.before, self.bias, self.largest = self.net.outputs.copy(), np.zeros((size, 1)), layer.largest
-        self.constants, self.is_finite = constants, True
+        self.constants, self.has_bias, self.is_finite = constants, layer.has_bias, True
 
     def settle(self) -> None:
         """Make of H and M what has been learnt since they were settled last. Infinite numbers are taken back.
@@ -328,7 +329,7 @@ class IdealisedNetwork:
         net = self.net
         f, moved, grown = self.before - self.bias, net.weights, net.grown
         with np.errstate(over="ignore", invalid="ignore"):
-            total = moved.sum(axis=1, keepdims=True)
+            total = self.has_bias * moved.sum(axis=1, keepdims=True)  # of the biases
             product = moved @ f.T
             by_features = (grown.T @ (f + net.gram @ grown / 2)).astype(np.float32)
             gram = net.gram + product + product.T + moved @ (net.last @ moved.T) - total @ total.T
@@ -340,7 +341,7 @@ class IdealisedNetwork:
             return
         net.last[:] += by_features
         self.bias += total
-        square = np.minimum(np.maximum(np.diag(net.last), 1.0), self.largest)
+        square = np.minimum(np.maximum(np.diag(net.last), self.has_bias), self.largest)
         root = np.sqrt(square).astype(np.float32)
         if math.isfinite(self.largest):  # hyperbolic tangents saturate
             shrunk = root / np.sqrt(np.maximum(np.diag(net.last), square))
@@ -348,7 +349,7 @@ class IdealisedNetwork:
         np.clip(net.last, -root[:, None] * root, root[:, None] * root, out=net.last)
         values, vectors = np.linalg.eigh((gram + gram.T) / 2)
         net.gram[:] = (vectors * np.maximum(values, 0.0)) @ vectors.T
-        least = ((net.outputs - self.bias) ** 2 / np.maximum(square - 1, 1e-3)).max(axis=1)
+        least = ((net.outputs - self.bias) ** 2 / np.maximum(square - self.has_bias, 1e-3)).max(axis=1)
         net.gram[np.diag_indices_from(gram)] = np.maximum(np.diag(net.gram), least)
         net.weights[:] = net.grown[:] = 0.0
         self.before[:] = net.outputs
