@@ -356,7 +356,18 @@ def other_cells():
         columns={"num_states": "states"}
     )
     columns = [cells[name].where(cells["agent"] == agent, 0.0) for agent, name in primary_predictors().items()]
-    return cells.assign(study="other-classes", steps=30_000, predicted=sum(columns))
+    cells = cells.assign(study="other-classes", steps=30_000, predicted=sum(columns))
+    return cells.merge(pd.read_csv(OTHER / "before.csv"), on=CELL)
+
+
+def before_of_other():
+    """Write what the predictors of before say of the ten other classes, computed after the runs."""
+    rows = []
+    for run in study.specification(OTHER / "study.yaml").runs:
+        if run.config["seed"] == 0:
+            value, _ = regret_of(run, {}, BEFORE[run.config["agent"]])
+            rows.append({**run.cell, "before": round(value, 6)})
+    pd.DataFrame(rows).to_csv(OTHER / "before.csv", index=False, lineterminator="\n")
 
 
 def other(resamples):
@@ -368,7 +379,9 @@ def other(resamples):
             print(f"| {agent.upper()} | {words} | {limit} | {found:.2f} | {'held' if held else 'failed'} |")
     for agent in OTHER_WIDTHS:
         cells = frame[frame["agent"] == agent]
-        print(f"| {agent.upper()} | {len(cells)} | {said_of(cells, resamples)} |")
+        print(f"| {agent.upper()} | `{primary_predictors()[agent]}` | {len(cells)} | {said_of(cells, resamples)} |")
+        earlier = cells.assign(predicted=cells["before"])
+        print(f"| {agent.upper()} | `{BEFORE[agent]}` | {len(cells)} | {said_of(earlier, resamples)} |")
     for agent in OTHER_WIDTHS:
         cells = frame[frame["agent"] == agent]
         misses = (cells["observed"] - cells["predicted"]).groupby(cells["environment"]).mean().sort_values()
@@ -665,6 +678,8 @@ def main():
     elif arguments.task == "cost":
         cost()
     elif arguments.task == "other":
+        if not (OTHER / "before.csv").exists():
+            before_of_other()
         other(arguments.resamples)
         draw(other_cells(), STUDIES.parent / "images" / "other-classes.png")
     elif arguments.task == "ablations":

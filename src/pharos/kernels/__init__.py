@@ -10,6 +10,6 @@ compiling.prepare()
 from pharos.kernels import outcomes  # noqa: E402  (it loads Numba)
 
 _shared = """
-    batched bellman elimination end_components gaps graph hash_table hitting horizon kernel_cache linear_algebra
-    many_searches observation_kernels occupancy outcomes partition patches stepping
+    actor_critic batched bellman elimination end_components gaps graph hash_table hitting horizon idealised_network
+    kernel_cache linear_algebra many_searches observation_kernels occupancy outcomes partition patches stepping
 """

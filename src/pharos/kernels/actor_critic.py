@@ -113,7 +113,7 @@ def play(outcomes, group, episodes, actor, critic, rollout, discounts):
 
 
 @kernel(makes_arrays=False)
-def improve(chance, actor, critic, rollout, settings, of_actor, of_critic):
+def learn_from_rollout(chance, actor, critic, rollout, settings, of_actor, of_critic):
     """Learn from a rollout. chance: as for `play`.
 
     settings: (epochs, size of a minibatch, clip range, weight of the entropy, of the values' loss, length to which the

@@ -138,7 +138,7 @@ def network_regret(
         the target O(A C^2). 0.1 s a walk of 30 thousand steps for 30 observations, 0.5 s for 400.
     Source: pharos; Mnih et al. (2015), Kingma and Ba (2015), and Jacot et al. (2018) for the kernels.
     """
-    learner = NetworkLearner(mdp, representation, schedule, horizon, solution, progress)
+    learner = NetworkQLearner(mdp, representation, schedule, horizon, solution, progress)
     learner.sampling, learner.adam = sampling or Sampling(), adam or Adam()
     return learner.measured_in_network({"schedule": schedule_of(learner)})
 
@@ -191,7 +191,7 @@ def schedule_of(learner: SampledLearner) -> dict[str, Any]:
     return {name: value for name, value in asdict(learner.schedule).items() if name != "optimizer"}
 
 
-class NetworkLearner(SampledLearner):
+class NetworkQLearner(SampledLearner):
     """A DQN in an idealised network. Base class of that of a PPO."""
 
     measure = "network_regret"
@@ -290,7 +290,7 @@ class IdealisedNetwork:
         beneath: np.ndarray,
         weights: float,
         outputs: np.ndarray,
-        constants: Any,
+        constants: tuple[tuple[float, ...], float],
         layer: OutputLayer,
     ):
         from pharos.kernels.idealised_network import Net
@@ -355,7 +355,7 @@ class IdealisedNetwork:
         self.before[:] = net.outputs
 
 
-class NetworkPolicyLearner(NetworkLearner, PolicyLearner):
+class NetworkPolicyLearner(NetworkQLearner, PolicyLearner):
     """A PPO in two idealised networks."""
 
     measure = "network_policy_regret"
@@ -397,7 +397,7 @@ class NetworkPolicyLearner(NetworkLearner, PolicyLearner):
                 yield self.regret(self.value(policy))
             if now < self.schedule.steps and is_finite:
                 kernels.play(self.outcomes, group, episodes, actor.net, critic.net, rollout, discounts)
-                kernels.improve(
+                kernels.learn_from_rollout(
                     episodes.chance, actor.net, critic.net, rollout, settings, actor.constants[0], critic.constants[0]
                 )
             if now == self.schedule.steps:
@@ -415,6 +415,6 @@ class NetworkPolicyLearner(NetworkLearner, PolicyLearner):
         length = size // count + 1
         states = np.full(count, -1, np.int64), np.full(count, -1, np.int64), np.zeros(count, np.int64)
         noise = float(self.sampling.reward_noise), words[1:].copy()
-        met = *(np.zeros(size, np.int64) for _ in range(2)), *(np.zeros(size) for _ in range(3))
+        steps = *(np.zeros(size, np.int64) for _ in range(2)), *(np.zeros(size) for _ in range(3))
         room = np.zeros(size, np.int64), *(np.zeros(length) for _ in range(3))
-        return Rollout(*states, words[:1].copy(), noise, *met, *room)
+        return Rollout(*states, words[:1].copy(), noise, *steps, *room)

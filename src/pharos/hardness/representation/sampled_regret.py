@@ -360,7 +360,7 @@ class SampledLearner(IdealisedLearner):
 
     def stretches(
         self, observations: Grouped, looks: np.ndarray, walk: "Walk"
-    ) -> Iterator[tuple[int, Callable[[Any, float], None]]]:
+    ) -> Iterator[tuple[int, Callable[[tuple[object, ...], float], None]]]:
         """Yield (step, a function that walks from it to the next) of all steps at which there is something to do.
 
         The function takes (kernel, learnt, target) as `kernels.stepping.learn` does, and the largest step of descent.
@@ -378,7 +378,7 @@ class SampledLearner(IdealisedLearner):
         for step, next_stop in zip(stops, [*stops[1:], schedule.steps], strict=True):
             self.report(f"step {step:,} of {schedule.steps:,} of a walk")
 
-            def run(values: Any, largest_step: float, steps: int = int(next_stop - step)) -> None:
+            def run(values: tuple[object, ...], largest_step: float, steps: int = int(next_stop - step)) -> None:
                 settings = (*numbers, largest_step, self.largest_error)
                 kernels.learn(self.outcomes, group, episodes, values, walk, settings, steps)
 
