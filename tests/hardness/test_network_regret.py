@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import strategies as st
 from test_kernel_measures import kernel_of
 from test_sampled_regret import WORLDS, plain_walk
 
@@ -19,9 +20,11 @@ from pharos.hardness import (
 )
 from pharos.hardness.representation.network_regret import (
     POLICY_WEIGHTS,
+    IdealisedNetwork,
     NetworkLearner,
     NetworkPolicyLearner,
 )
+from strategies import examples
 
 SHORT = Schedule(steps=700, period=50, gradient_steps=13, learning_starts=60, gamma=0.9)
 ONCE = Sampling(walks=1, batch_size=8, buffer_size=150)
@@ -155,3 +158,53 @@ def test_a_walk_of_a_ppo_is_the_definition(name, play):
         twin.settle()
         assert np.abs(twin.outputs - before).max() > 0.02
         assert_same(network, twin)
+
+
+# H and M --------------------------------------------------------------------------------------------------------------
+
+
+def network_of(W, h, bias, largest=math.inf):
+    """The idealised network of outputs W h + bias, W (A, n), h (n, C), bias (A, 1)."""
+    layer, last = OutputLayer(None, 1.0, (1, 1), (1.0, 1.0), largest), np.asarray(h.T @ h + 1, np.float32)
+    network = IdealisedNetwork(last, np.eye(len(last), dtype=np.float32), 1.0, W @ h + bias, None, layer)
+    network.net.gram[:], network.bias = W @ W.T, bias.copy()
+    return network
+
+
+sizes = st.tuples(st.integers(1, 4), st.integers(2, 6), st.integers(1, 5))
+
+
+@examples(100, sizes, st.floats(0.3, 3.0), st.floats(0.01, 1.0), st.integers(0, 99))
+def test_kernels_are_those_of_a_network_that_is_linear_in_weights_and_in_features(size, scale, move, seed):
+    """Both move at once, twice: W by errors at features, h by gradients through the weights of before."""
+    (A, n, C), rng = size, np.random.default_rng(seed)
+    W, h, bias = rng.normal(size=(A, n)), scale * rng.normal(size=(n, C)), rng.normal(size=(A, 1))
+    network = network_of(W, h, bias)
+    for _ in range(2):
+        moved, grown = move * rng.normal(size=(2, A, C))
+        W, h, bias = W + moved @ h.T, h + W.T @ grown, bias + moved.sum(axis=1, keepdims=True)
+        network.net.weights[:], network.net.grown[:], network.net.outputs[:] = moved, grown, W @ h + bias
+        network.settle()
+        np.testing.assert_allclose(network.net.last, h.T @ h + 1, rtol=0, atol=1e-4 * np.abs(h.T @ h + 1).max())
+        np.testing.assert_allclose(network.net.gram, W @ W.T, rtol=0, atol=1e-3 * np.abs(W @ W.T).max())
+        np.testing.assert_allclose(network.bias, bias, rtol=1e-9, atol=1e-9)
+        assert not network.net.weights.any() and not network.net.grown.any() and network.is_finite
+
+
+@examples(200, sizes, st.floats(0.1, 3.0), st.floats(0.01, 30.0), st.sampled_from([5.0, math.inf]), st.integers(0, 99))
+def test_kernels_are_products_of_some_vectors_whatever_the_outputs_are(size, scale, move, largest, seed):
+    (A, n, C), rng = size, np.random.default_rng(seed)
+    W, h = rng.normal(size=(A, n)), scale * rng.normal(size=(n, C))
+    network = network_of(W, h, np.zeros((A, 1)), largest)
+    net = network.net
+    for _ in range(3):
+        net.weights[:], net.grown[:], net.outputs[:] = move * rng.normal(size=(3, A, C))
+        network.settle()
+        squares, M = np.diag(net.last).astype(float), net.gram
+        assert network.is_finite and squares.min() >= 1 and squares.max() <= largest * (1 + 1e-6)
+        assert (net.last.astype(float) ** 2 <= np.outer(squares, squares) * (1 + 1e-5)).all()
+        np.testing.assert_array_equal(net.last, net.last.T)
+        np.testing.assert_allclose(M, M.T, rtol=0, atol=1e-12 * np.abs(M).max())
+        assert np.linalg.eigvalsh(M).min() >= -1e-9 * np.abs(M).max()
+        most = np.diag(M)[:, None] * np.maximum(squares - 1, 1e-3)
+        assert ((net.outputs - network.bias) ** 2 <= most * (1 + 1e-4)).all()
