@@ -241,10 +241,10 @@ class NetworkLearner(SampledLearner):
         observations, looks = self.observations, self.steps()
         walk, network = self.first_walk(len(observations), seed), self.network(seed)
         for step, run in self.stretches(observations, looks, walk):
+            if self.is_copied(step) or not np.isfinite(network.net.outputs).all():
+                network.settle()
             if step in looks:
                 yield self._regret_of(network.net.outputs.T, observations)
-            if self.is_copied(step):
-                network.settle()
             if network.is_finite:
                 run((network.constants, network.net, network.before), 0.0)
         self.diverged += not network.is_finite
