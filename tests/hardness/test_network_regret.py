@@ -1,22 +1,30 @@
 """DQN and PPO in an idealised network: against slow twins, explicit networks, and networks of PyTorch."""
 
+import json
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from hypothesis import strategies as st
-from test_kernel_measures import kernel_of
+from test_kernel_measures import chain, kernel_of, random_mdp
 from test_sampled_regret import WORLDS, plain_walk
 
+import pharos
 from naive import networks as naive
+from pharos import hardness
+from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness import (
     Adam,
+    Network,
     OutputLayer,
     Representation,
     Rollouts,
     Sampling,
     Schedule,
+    network_policy_regret,
+    network_regret,
 )
 from pharos.hardness.representation.network_regret import (
     POLICY_WEIGHTS,
@@ -24,6 +32,7 @@ from pharos.hardness.representation.network_regret import (
     NetworkLearner,
     NetworkPolicyLearner,
 )
+from pharos.observations import network_inputs, observe, representation
 from strategies import examples
 
 SHORT = Schedule(steps=700, period=50, gradient_steps=13, learning_starts=60, gamma=0.9)
@@ -208,3 +217,195 @@ def test_kernels_are_products_of_some_vectors_whatever_the_outputs_are(size, sca
         assert np.linalg.eigvalsh(M).min() >= -1e-9 * np.abs(M).max()
         most = np.diag(M)[:, None] * np.maximum(squares - 1, 1e-3)
         assert ((net.outputs - network.bias) ** 2 <= most * (1 + 1e-4)).all()
+
+
+# Networks of PyTorch --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def grid(tmp_path_factory):
+    env = pharos.make("simple_grid", height=3, width=4)
+    return pharos.build(env, tmp_path_factory.mktemp("space") / "grid", progress=False)
+
+
+def module(torch, name, shape):
+    """A network of that name in plain PyTorch, of one output: orthogonal if it has hyperbolic tangents."""
+    nn, layers = torch.nn, []
+    if name.startswith("cnn4"):
+        layers = [nn.Conv2d(shape[0], 4, 3, padding=1), nn.ReLU(), nn.Flatten(), nn.Linear(4 * shape[1] * shape[2], 32)]
+        layers += [nn.ReLU(), nn.Linear(32, 1)]
+    else:
+        units = 512 if "512" in name else 64
+        layers = [nn.Linear(shape[0], units), nn.ReLU(), nn.Linear(units, units)]
+        layers += [nn.Tanh() if "tanh" in name else nn.ReLU(), nn.Linear(units, 1)]
+    if "tanh" in name:
+        for layer in layers[::2]:
+            nn.init.orthogonal_(layer.weight, 1.0 if layer is layers[-1] else math.sqrt(2))
+            nn.init.zeros_(layer.bias)
+    return nn.Sequential(*layers)
+
+
+@pytest.mark.parametrize(
+    ("observation", "name", "initialisation"),
+    [("vector", "mlp64x2", "pytorch"), ("vector", "mlp64x2+tanh", "sb3"), ("simple_image", "cnn4-32", "pytorch")],
+)
+def test_an_output_layer_is_the_mean_over_random_networks(grid, observation, name, initialisation):
+    """Its kernel, the squared weights of its outputs, and the numbers of parameters."""
+    torch = pytest.importorskip("torch")
+    states = np.array([0, 3, 5, 8])
+    x = network_inputs(observe(grid.environment, observation), grid.states(states))
+    layer = representation(grid, observation, name, initialisation=initialisation).output_layer
+    products, weights = [], []
+    with torch.random.fork_rng(devices=[]), torch.no_grad():
+        torch.manual_seed(0)
+        for _ in range(400):
+            made = module(torch, name, x.shape[1:])
+            hidden = made[:-1](torch.as_tensor(x)).numpy()
+            products.append(hidden @ hidden.T + 1)
+            weights.append(float((made[-1].weight ** 2).sum()))
+    size = [sum(each.numel() for each in part.parameters()) for part in (made[-1], made[:-1])]
+    assert layer.parameters == tuple(size) == Network.of(name, initialisation).parameters(x.shape[1:])
+    deviation = np.std(products, axis=0) / math.sqrt(len(products))
+    kernel = layer.kernel(states, states)
+    assert (np.abs(kernel - np.mean(products, axis=0)) <= 4 * deviation + 0.01 * kernel).all()
+    assert layer.weights == pytest.approx(np.mean(weights), rel=0.02)
+    assert layer.largest == (65.0 if "tanh" in name else math.inf)
+
+
+@pytest.mark.parametrize("name", ["mlp512x2", "mlp512x2+tanh"])
+def test_evenness_is_how_even_gradients_of_one_observation_are(name):
+    """A mean over 20 networks, of which one deviates by 1 %. At 512 units the closed form is 2 % off."""
+    torch = pytest.importorskip("torch")
+    x, found = torch.linspace(0.1, 1.0, 5)[None], []
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        for _ in range(20):
+            made = module(torch, name, (5,))
+            made(x).sum().backward()
+            gradients = [made[i].weight.grad.abs() for i in (-1, 2)]
+            found.append([float(each.mean() / (each**2).mean().sqrt()) for each in gradients])
+    expected = Network.of(name, "sb3" if "tanh" in name else "pytorch").evenness
+    np.testing.assert_allclose(np.mean(found, axis=0), expected, rtol=0.03)
+
+
+# Limits ---------------------------------------------------------------------------------------------------------------
+
+
+BOTH = pytest.mark.parametrize("measure", [network_regret, network_policy_regret])
+FEW = {"schedule": SHORT, "sampling": Sampling(walks=2, batch_size=8)}
+
+
+@BOTH
+def test_without_a_learning_rate_policies_stay_as_they_are(measure):
+    if measure is network_policy_regret:
+        measure = partial(measure, rollouts=Rollouts(steps=64, clip_range=0.2))
+    still, learnt = (
+        measure(random_mdp(7, 2), seen_by(7), adam=Adam(learning_rate=rate), **FEW) for rate in (1e-12, 0.01)
+    )
+    np.testing.assert_allclose(still.curve.greedy - still.curve.greedy[:, :1], 0.0, atol=1e-6)
+    np.testing.assert_allclose(learnt.curve.greedy[:, 0], still.curve.greedy[:, 0], atol=1e-6)
+    assert learnt.value < still.value - 0.1
+
+
+def test_a_network_starts_from_the_covariance_of_its_outputs_each_for_itself():
+    learner = recorded(NetworkLearner, random_mdp(7, 3), seen_by(7), Schedule(steps=1), FAST, ONCE)[1]
+    starts = np.array([learner.network(seed, share=0.25).before for seed in range(3000)])
+    expected = 0.25 * 0.5 / 16 * learner.last
+    for a in range(3):
+        for b in range(3):
+            found = np.einsum("nx,ny->xy", starts[:, a], starts[:, b]) / len(starts)
+            np.testing.assert_allclose(found, expected * (a == b), atol=0.1 * expected.max())
+
+
+@BOTH
+def test_a_seed_gives_its_number_and_another_another(measure):
+    first, again = (measure(random_mdp(7, 2), seen_by(7), adam=FAST, **FEW) for _ in range(2))
+    assert first.to_dict() == again.to_dict()
+    sampling = replace(FEW["sampling"], seed=1, walks=1)
+    second = measure(random_mdp(7, 2), seen_by(7), adam=FAST, schedule=SHORT, sampling=sampling)
+    np.testing.assert_array_equal(second.curve.greedy[0], first.curve.greedy[1])
+    assert (second.curve.greedy[0] != first.curve.greedy[0]).any()
+    assert math.isnan(second.curve.deviation) and "deviation" not in second.to_dict()
+    assert (
+        first.note.startswith(f"{first.name}: a mean over 2 walks") and second.note == f"{first.name}: of a single walk"
+    )
+    assert first.value == pytest.approx(first.curve.greedy.mean()) and first.to_dict()["diverged"] == 0
+
+
+@BOTH
+@pytest.mark.parametrize("noise", [0.0, 0.5])
+def test_a_scale_of_rewards_is_another_unit_of_them(measure, noise):
+    mdp, sampling = random_mdp(7, 2), replace(FEW["sampling"], reward_noise=noise)
+    options = {"schedule": SHORT, "adam": FAST}
+    scaled = measure(mdp, seen_by(7), sampling=replace(sampling, reward_scale=8.0), **options)
+    smaller = measure(mdp.with_rewards(mdp.rewards / 8), seen_by(7), sampling=sampling, **options)
+    np.testing.assert_array_equal(scaled.curve.greedy, smaller.curve.greedy)
+    assert (scaled.curve.greedy != measure(mdp, seen_by(7), sampling=sampling, **options).curve.greedy).any()
+
+
+def test_a_report_has_both_and_keeps_them(grid):
+    names, mdp = ["network_regret", "network_policy_regret"], grid.mdp(gamma=1.0).with_horizon(20)
+    seen = representation(grid, "vector", "mlp16x2")
+    options = {"representation": seen, "schedule": SHORT, "sampling": FEW["sampling"], "adam": FAST}
+    first, again, other = (
+        hardness.report(mdp, names, **{**options, **more}) for more in ({}, {}, {"adam": Adam(learning_rate=0.02)})
+    )
+    for name in names:
+        direct = getattr(hardness, name)(mdp, **{**options, "representation": seen})
+        assert first[name].value == direct.to_dict() and first[name].certificate.note == direct.note
+        assert again[name].kept and again[name].value == json.loads(json.dumps(first[name].value))
+        assert not other[name].kept and other[name].value["curve"] != first[name].value["curve"]
+        assert first[name].value["conventions"]["adam"]["learning_rate"] == 0.01
+
+
+# What is refused, and what becomes infinite ---------------------------------------------------------------------------
+
+
+@BOTH
+def test_what_it_is_not_defined_for_is_said(measure, monkeypatch):
+    name = measure.__name__
+    with pytest.raises(UndefinedMeasure, match=f"{name} needs a network whose output layer is known"):
+        measure(random_mdp(7, 2), Representation.of_matrix(kernel_of(7)), **FEW)
+    with pytest.raises(UndefinedMeasure, match=f"{name}: uniform play is optimal"):
+        measure(chain().with_rewards(np.zeros((4, 2))), seen_by(4), **FEW)
+    with pytest.raises(UndefinedMeasure, match=f"{name} is defined for episodes"):
+        measure(chain(horizon=None, gamma=0.9), seen_by(4), **FEW)
+    monkeypatch.setattr("pharos.hardness.representation.network_regret.MOST_OBSERVATIONS", 5)
+    with pytest.raises(UndefinedMeasure, match=f"{name}: 6 different observations; it is for at most 5"):
+        measure(random_mdp(7, 2), seen_by(7), **FEW)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (lambda: Adam(learning_rate=0.0), r"adam: learning_rate is 0.0; expected a number above 0"),
+        (lambda: Adam(max_grad_norm=math.inf), r"adam: max_grad_norm is inf; expected a number above 0"),
+        (lambda: Adam(epsilon=-1.0), r"adam: epsilon is -1.0; expected a number above 0"),
+        (lambda: Adam(decay=1.0), r"adam: decay is 1.0; expected a number in \[0, 1\)"),
+        (lambda: Adam(decay_of_squares=math.nan), r"adam: decay_of_squares is nan; expected a number in \[0, 1\)"),
+        (lambda: Rollouts(environments=0), r"rollouts: environments is 0"),
+        (lambda: Rollouts(epochs=1.5), r"rollouts: epochs is 1.5"),
+        (lambda: Rollouts(steps=100, environments=8), r"rollouts: 100 steps are not divided by 8 environments"),
+        (lambda: Rollouts(entropy_weight=-0.1), r"rollouts: entropy_weight is -0.1; expected at least 0"),
+        (lambda: Rollouts(value_weight=math.inf), r"rollouts: value_weight is inf; expected at least 0"),
+    ],
+)
+def test_options_that_are_none_are_refused(options, message):
+    with pytest.raises(ParameterError, match=message):
+        options()
+
+
+def test_rollouts_that_their_environments_do_not_divide_are_refused():
+    with pytest.raises(ParameterError, match="rollouts: 100 steps are not divided by 8 environments"):
+        network_policy_regret(random_mdp(7, 2), seen_by(7), rollouts=Rollouts(steps=100), **FEW)
+
+
+@BOTH
+@pytest.mark.parametrize("rate", [1e3, 1e10, 1e15, 1e19, 1e30, 1e160, 1e307])
+@pytest.mark.parametrize("largest", [math.inf, 9.0])
+def test_values_that_become_infinite_are_taken_back_and_counted(measure, rate, largest):
+    found = measure(random_mdp(7, 2), seen_by(7, largest=largest), adam=Adam(learning_rate=rate), **FEW)
+    assert np.isfinite(found.curve.greedy).all() and math.isfinite(found.value)
+    assert found.diverged == 2 or rate < 1e30
+    text = f"values of {found.diverged} of 2 walks became infinite"
+    assert (text in found.note) == (found.diverged > 0) and found.to_dict()["diverged"] == found.diverged
