@@ -40,12 +40,12 @@ ONCE = Sampling(walks=1, batch_size=8, buffer_size=150)
 FAST = Adam(learning_rate=0.01)
 
 
-def seen_by(num_states, classes=None, *, largest=math.inf):
+def seen_by(num_states, classes=None, *, largest=math.inf, bias=1.0):
     """A representation of random features, whose output layer has 16 units."""
     numbers = np.arange(num_states) if classes is None else classes
     hidden = np.random.default_rng(5).random((num_states, 16))[numbers]
     last, whole = hidden @ hidden.T + 1, np.asarray(kernel_of(num_states), np.float64)[np.ix_(numbers, numbers)]
-    layer = OutputLayer(lambda x, y: last[np.ix_(x, y)], 0.5, (17, 64), (0.6, 0.4), largest)
+    layer = OutputLayer(lambda x, y: last[np.ix_(x, y)], 0.5, (17, 64), (0.6, 0.4), largest, bias)
     return Representation.of_matrix(whole + last, numbers, output_layer=layer)
 
 
@@ -269,6 +269,7 @@ def test_an_output_layer_is_the_mean_over_random_networks(grid, observation, nam
     kernel = layer.kernel(states, states)
     assert (np.abs(kernel - np.mean(products, axis=0)) <= 4 * deviation + 0.01 * kernel).all()
     assert layer.weights == pytest.approx(np.mean(weights), rel=0.02)
+    assert layer.bias == (0.0 if "tanh" in name else 1.0)
     assert layer.largest == (65.0 if "tanh" in name else math.inf)
 
 
@@ -307,14 +308,28 @@ def test_without_a_learning_rate_policies_stay_as_they_are(measure):
     assert learnt.value < still.value - 0.1
 
 
-def test_a_network_starts_from_the_covariance_of_its_outputs_each_for_itself():
-    learner = recorded(NetworkLearner, random_mdp(7, 3), seen_by(7), Schedule(steps=1), FAST, ONCE)[1]
+@pytest.mark.parametrize("bias", [0.0, 1.0])
+def test_a_network_starts_from_the_covariance_of_its_outputs_each_for_itself(bias):
+    learner = recorded(NetworkLearner, random_mdp(7, 3), seen_by(7, bias=bias), Schedule(steps=1), FAST, ONCE)[1]
     starts = np.array([learner.network(seed, share=0.25).before for seed in range(3000)])
-    expected = 0.25 * 0.5 / 16 * learner.last
+    expected = 0.25 * 0.5 / 16 * (learner.last - 1 + bias)
     for a in range(3):
         for b in range(3):
             found = np.einsum("nx,ny->xy", starts[:, a], starts[:, b]) / len(starts)
             np.testing.assert_allclose(found, expected * (a == b), atol=0.1 * expected.max())
+
+
+def test_outputs_of_zeros_without_biases_start_at_zero_and_say_nothing_of_weights(grid):
+    seen, mdp = (
+        representation(grid, "vector", "mlp64x2+tanh", initialisation="sb3"),
+        grid.mdp(gamma=1.0).with_horizon(20),
+    )
+    schedule = Schedule(steps=1)
+    _, learner, *_ = recorded(NetworkPolicyLearner, mdp, seen, schedule, FAST, ONCE, Rollouts(steps=8))
+    network, zeros = learner.network(3), learner.observations.groups[learner.numbers == grid.index((0, 0))]
+    np.testing.assert_allclose(network.before[:, zeros], 0.0, atol=1e-7)
+    network.settle()
+    np.testing.assert_allclose(network.net.gram, learner.layer.weights * np.eye(4), atol=1e-12)
 
 
 @BOTH

@@ -36,6 +36,7 @@ class OutputLayer:
         evenness: of the output layer and of the layers beneath: the mean size of a parameter's gradient as a share of
             its root mean square. Adam moves each parameter alike, so that 1 is where all have the same gradient.
         largest: of h(x) . h(x) + 1. Infinite for ReLUs.
+        bias: variance of an output's bias before training as a share of that of a weight: 0 where biases begin at 0.
     """
 
     kernel: Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -43,6 +44,7 @@ class OutputLayer:
     parameters: tuple[int, int]
     evenness: tuple[float, float]
     largest: float = math.inf
+    bias: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -263,8 +263,8 @@ class NetworkLearner(SampledLearner):
 
     @cached_property
     def root(self) -> np.ndarray:
-        """(C, C): R of R' R = H, the kernel of the output layer."""
-        values, vectors = np.linalg.eigh(self.last.astype(np.float64))
+        """(C, C): R of R' R = the covariance of outputs before training, in units of a weight's variance."""
+        values, vectors = np.linalg.eigh(self.last.astype(np.float64) - (1.0 - self.layer.bias))
         return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
 
 
