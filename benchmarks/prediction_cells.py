@@ -11,6 +11,7 @@
     python benchmarks/prediction_cells.py draw [--cells cells.csv] [--picture docs/images/sealed.png]
     python benchmarks/prediction_cells.py other [--picture docs/images/other-classes.png]
     python benchmarks/prediction_cells.py ablations [--cells ablations.csv]
+    python benchmarks/prediction_cells.py units [--cells cells.csv]
     python benchmarks/prediction_cells.py cost
 
 `compute` reads the packed runs of docs/studies (twelve development classes: hardness-dev; fourteen sealed ones:
@@ -645,7 +646,7 @@ def main():
         "task",
         choices=(
             *("compute", "judge", "orders", "held", "sealed", "collect", "third", "pilots", "draw", "cost"),
-            *("other", "ablations"),
+            *("other", "ablations", "units"),
         ),
     )
     parser.add_argument("--out", type=Path, default=CELLS_FILE)
@@ -682,6 +683,8 @@ def main():
             before_of_other()
         other(arguments.resamples)
         draw(other_cells(), STUDIES.parent / "images" / "other-classes.png")
+    elif arguments.task == "units":
+        units(pd.read_csv(arguments.cells))
     elif arguments.task == "ablations":
         ablations(arguments.cells, arguments.resamples)
     else:

@@ -32,13 +32,16 @@ def chain(length=4, **options):
     return TabularMDP.from_arrays(table, rewards, **{"gamma": 1.0, "horizon": 12, **options})
 
 
-def random_mdp(states=7, seed=0):
-    """Two outcomes an action, two start states, an end, rewards that differ."""
+def random_mdp(states=7, seed=0, *, lacks=False):
+    """Two outcomes an action, two start states, an end, rewards that differ. lacks: one action of three is not
+    available, the same one in states 2 i and 2 i + 1."""
     rng = np.random.default_rng(seed)
     successors = rng.integers(0, states, (states, 3, 2))
     probabilities = rng.dirichlet([1, 1], (states, 3))
     rewards = rng.random((states, 3))
     successors[-1], probabilities[-1], rewards[-1] = states - 1, [1.0, 0.0], 0.0
+    if lacks:
+        rewards[np.arange(states - 1), np.arange(states - 1) // 2 % 3] = -np.inf
     options = {"horizon": 9, "initial": [0, 1], "terminal": np.arange(states) == states - 1}
     return TabularMDP.from_outcomes(successors, probabilities, rewards, gamma=1.0, **options)
 

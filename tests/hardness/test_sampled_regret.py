@@ -20,22 +20,24 @@ SHORT = Schedule(steps=700, period=50, gradient_steps=13, learning_starts=60, ga
 ONCE = Sampling(walks=1, batch_size=8, buffer_size=150)
 
 
-def plain_walk(mdp, kernel, classes, schedule, sampling, episode, steps, start=0.0, largest_error=math.inf):
-    """Q (C, A) after so many steps of the first walk: the definition in plain Python, with the same random numbers."""
+def plain_walk(
+    mdp, kernel, classes, schedule, sampling, episode, steps, start=0.0, largest_error=math.inf, network=None
+):
+    """Q (C, A) after so many steps of the first walk: the definition in plain Python, with the same random numbers.
+
+    network: an idealised one in the place of the kernel, as of `naive.networks`.
+    """
     words = np.random.SeedSequence(sampling.seed, spawn_key=(2,)).generate_state(2, np.uint64)
     rng, noises = naive_learning.SplitMix64(words[0]), naive_learning.SplitMix64(words[1])
-    S, A, chance = mdp.num_states, mdp.num_actions, mdp.chance
-    rows = [[] for _ in range(S * A)]
-    for row, t, r, p in zip(*(column.tolist() for column in paid_outcomes(mdp)), strict=True):
-        rows[row].append((t, r, p))
-    cumulative = np.cumsum(mdp.start_probabilities)
-    cumulative[-1] = 1.0
-    C = max(classes) + 1
+    A, C, course = mdp.num_actions, max(classes) + 1, naive_learning.Episodes(mdp, rng, episode)
+    sets = {classes[s]: choices for s, choices in enumerate(course.choices)}
     Q, visits, memory = np.zeros((C, A)) + start, np.zeros((C, A)), []
-    target, state, previous, elapsed, largest_step = Q.copy(), None, None, 0, 0.0
+    target, largest_step = Q.copy(), 0.0
     ends = schedule.exploration_fraction * schedule.steps
     for t in range(steps):
         if t % schedule.period == 0 and t + schedule.period > schedule.learning_starts:
+            if network is not None:
+                network.settle()
             target = Q.copy()
             share = visits.max(axis=1) / max(t, 1)
             root = np.sqrt(share)
@@ -43,60 +45,48 @@ def plain_walk(mdp, kernel, classes, schedule, sampling, episode, steps, start=0
             if (kernel == np.eye(C)).all():
                 largest = share.max()  # to the last bit
             largest_step = 1 / (1.05 * largest) if t else math.inf
-        if state is None:
-            u = rng.random()
-            state = int(mdp.start_states[np.searchsorted(cumulative, u, side="right")])
-            previous, elapsed = None, 0
-        c, share = classes[state], min(1.0, t / ends)
+        course.begin()
+        c, share = classes[course.state], min(1.0, t / ends)
         epsilon = schedule.exploration_initial_eps
         epsilon = epsilon + share * (schedule.exploration_final_eps - epsilon)
         if rng.random() < (epsilon if t >= schedule.learning_starts else 1.0):
-            action = rng.below(A)
+            action = course.uniform()
         else:
-            action, ties = 0, 1
-            for a in range(1, A):
+            (action, *others), ties = sets[c], 1
+            for a in others:
                 if Q[c, a] > Q[c, action]:
                     action, ties = a, 1
                 elif Q[c, a] == Q[c, action]:
                     ties += 1
                     action = a if rng.random() * ties < 1 else action
-        executed, u = action, rng.random()
-        if previous is None:
-            executed = action if u < chance.first_chosen else rng.below(A)
-        elif u >= chance.chosen:
-            executed = previous if u < chance.chosen + chance.previous else rng.below(A)
-        outcomes = rows[state * A + executed]
-        new, reward, _ = outcomes[0]
-        if len(outcomes) > 1:
-            u, total, passed = rng.random(), sum(p for *_, p in outcomes), 0.0
-            for new, reward, p in outcomes:  # noqa: B007
-                passed += p
-                if u < passed / total:
-                    break
-        ended = new == S or bool(mdp.terminal[new])
-        paid = reward + (sampling.reward_noise * naive_learning.normal(noises) if sampling.reward_noise else 0.0)
-        entry = (c, action, None if ended else classes[new], paid)
+        reward, new, ended, _ = course.step(action)
+        noise = sampling.reward_noise * naive_learning.normal(noises) if sampling.reward_noise else 0.0
+        entry = (c, action, None if ended else classes[new], reward / sampling.reward_scale + noise)
         if len(memory) < sampling.buffer_size:
             memory.append(entry)
         else:
             memory[t % sampling.buffer_size] = entry
         visits[c, action] += 1
-        previous, elapsed = executed, elapsed + 1
-        state = None if ended or elapsed >= episode else new
         late = t - schedule.learning_starts
         if late < 0:
             continue
         grown = [(late + i) * schedule.gradient_steps // schedule.period for i in (0, 1)]
         for _ in range(grown[1] - grown[0]):
             batch = [memory[rng.below(len(memory))] for _ in range(sampling.batch_size)]
-            errors = [r + (0.0 if d is None else schedule.gamma * max(target[d])) - Q[x, a] for x, a, d, r in batch]
+            errors = [
+                r + (0.0 if d is None else schedule.gamma * max(target[d, sets[d]])) - Q[x, a] for x, a, d, r in batch
+            ]
+            cut = [error if abs(error) <= largest_error else math.copysign(largest_error, error) for error in errors]
+            if network is not None:
+                network.learn([(x, a) for x, a, *_ in batch], cut)
+                Q = network.outputs.T.copy()
+                continue
             likeness = [
                 sum(abs(float(kernel[x, y])) for y, b, *_ in batch if a == b) / len(batch) for x, a, *_ in batch
             ]
             step = min(largest_step, 1 / max(likeness)) / len(batch)
-            for (x, a, *_), error in zip(batch, errors, strict=True):
-                cut = error if abs(error) <= largest_error else math.copysign(largest_error, error)
-                Q[:, a] += step * cut * np.asarray(kernel[x], np.float64)
+            for (x, a, *_), error in zip(batch, cut, strict=True):
+                Q[:, a] += step * error * np.asarray(kernel[x], np.float64)
     return Q
 
 
@@ -113,7 +103,7 @@ def both_walks(mdp, kernel, classes, sampling, *, schedule=SHORT, episode=7, ope
     seen = Representation.of_matrix(kernel, classes, covariance=lambda x, y: kernel[np.ix_(x, y)] / 50)
     learner = of(mdp, seen, schedule, episode)
     learner.sampling, observations = sampling, learner.observations
-    some, number = observations.representatives, np.zeros(mdp.num_states, np.int64)
+    some, number = observations.representatives, np.full(mdp.num_states, -1)  # unseen: the end, or out of reach
     number[learner.numbers] = observations.groups
     operator = operator or Precise(lambda x, y: kernel[np.ix_(x, y)], some)
     *_, compiled = learner.walk(observations, operator, np.array([0, schedule.steps]), sampling.seed)
@@ -129,6 +119,7 @@ WORLDS = {
     "both": lambda: random_actions(sticky_actions(random_mdp(7, 6), 0.4), 0.2),
     "lazy": lambda: lazy_actions(random_mdp(7, 7), 0.3),
     "one outcome": lambda: chain(5),
+    "sets": lambda: random_actions(sticky_actions(random_mdp(7, 8, lacks=True), 0.4), 0.2),
 }
 
 

@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from naive import mdp as naive_mdp
+from pharos.mdp import paid_outcomes
 
 MASK = (1 << 64) - 1
 
@@ -37,6 +38,56 @@ def drawn(mdp, s, x, rng):
         if passed > u:
             return t
     return outcomes[-1][0]
+
+
+class Episodes:
+    """Episodes of at most `limit` steps, one after another, by the numbers of the compiled walks of learners.
+
+    Attributes:
+        state: None before an episode. choices: (S) lists of available actions.
+    """
+
+    def __init__(self, mdp, rng, limit):
+        self.mdp, self.rng, self.limit, self.state = mdp, rng, limit, None
+        available = np.ones((mdp.num_states, mdp.num_actions), bool) if mdp.available is None else mdp.available
+        self.choices = [np.flatnonzero(row).tolist() for row in available]
+        self.rows = [[] for _ in range(mdp.num_states * mdp.num_actions)]
+        for row, t, r, p in zip(*(column.tolist() for column in paid_outcomes(mdp)), strict=True):
+            self.rows[row].append((t, r, p))
+
+    def begin(self):
+        """Start an episode if none is under way."""
+        if self.state is None:
+            cumulative = np.cumsum(self.mdp.start_probabilities)
+            cumulative[-1] = 1.0
+            self.state = int(self.mdp.start_states[np.searchsorted(cumulative, self.rng.random(), side="right")])
+            self.previous, self.elapsed = None, 0
+
+    def uniform(self):
+        """A uniform one of the available actions."""
+        return self.choices[self.state][self.rng.below(len(self.choices[self.state]))]
+
+    def step(self, action):
+        """(reward, next state, whether the episode ended there, whether its limit cut it)."""
+        mdp, chance, previous = self.mdp, self.mdp.chance, self.previous
+        executed, u = action, self.rng.random()
+        if previous is None or previous not in self.choices[self.state]:
+            executed = action if u < chance.first_chosen else self.uniform()
+        elif u >= chance.chosen:
+            executed = previous if u < chance.chosen + chance.previous else self.uniform()
+        outcomes = self.rows[self.state * mdp.num_actions + executed]
+        new, reward, _ = outcomes[0]
+        if len(outcomes) > 1:
+            u, total, passed = self.rng.random(), sum(p for *_, p in outcomes), 0.0
+            for new, reward, p in outcomes:  # noqa: B007
+                passed += p
+                if u < passed / total:
+                    break
+        ended = new == mdp.num_states or bool(mdp.terminal[new])
+        self.previous, self.elapsed = executed, self.elapsed + 1
+        is_cut = not ended and self.elapsed >= self.limit
+        self.state = None if ended or is_cut else new
+        return reward, new, ended, is_cut
 
 
 def normal(rng):

@@ -40,6 +40,7 @@ class OutputLayer:
             squares over up to 64 different observations.
         largest: of h(x) . h(x) + 1. Infinite for ReLUs.
         has_bias: whether an output has a bias.
+        bias: variance of an output's bias before training as a share of that of a weight: 0 where biases begin at 0.
     """
 
     kernel: Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -48,6 +49,7 @@ class OutputLayer:
     evenness: tuple[float, float]
     largest: float = math.inf
     has_bias: bool = True
+    bias: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)

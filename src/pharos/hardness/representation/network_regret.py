@@ -247,10 +247,10 @@ class NetworkQLearner(SampledLearner):
         observations, looks = self.observations, self.steps()
         walk, network = self.first_walk(len(observations), seed), self.network(seed)
         for step, run in self.stretches(observations, looks, walk):
+            if self.is_copied(step) or not np.isfinite(network.net.outputs).all():
+                network.settle()
             if step in looks:
                 yield self._regret_of(network.net.outputs.T, observations)
-            if self.is_copied(step):
-                network.settle()
             if network.is_finite:
                 run((network.constants, network.net, network.before), 0.0)
         self.diverged += not network.is_finite
@@ -270,8 +270,8 @@ class NetworkQLearner(SampledLearner):
 
     @cached_property
     def root(self) -> np.ndarray:
-        """(C, C): R of R' R = H, the kernel of the output layer."""
-        values, vectors = np.linalg.eigh(self.last.astype(np.float64))
+        """(C, C): R of R' R = the covariance of outputs before training, in units of a weight's variance."""
+        values, vectors = np.linalg.eigh(self.last.astype(np.float64) - (1.0 - self.layer.bias))
         return np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
 
 
@@ -324,7 +324,7 @@ class IdealisedNetwork:
         """Make of H and M what has been learnt since they were settled last. Infinite numbers are taken back.
 
         Outputs do not follow the Gram matrices exactly, so that these are held to what products can be: |f_a(x)|^2 <=
-        M_aa (H(x, x) - 1), H(x, y)^2 <= H(x, x) H(y, y), M positive semidefinite.
+        M_aa (H(x, x) - 1), H(x, y)^2 <= H(x, x) H(y, y), H(x, x) >= 1, M positive semidefinite.
         """
         net = self.net
         f, moved, grown = self.before - self.bias, net.weights, net.grown
@@ -347,6 +347,7 @@ class IdealisedNetwork:
             shrunk = root / np.sqrt(np.maximum(np.diag(net.last), square))
             net.last[:] *= shrunk[:, None] * shrunk
         np.clip(net.last, -root[:, None] * root, root[:, None] * root, out=net.last)
+        np.fill_diagonal(net.last, np.maximum(np.diag(net.last), 1.0))  # the bias alone is 1
         values, vectors = np.linalg.eigh((gram + gram.T) / 2)
         net.gram[:] = (vectors * np.maximum(values, 0.0)) @ vectors.T
         least = ((net.outputs - self.bias) ** 2 / np.maximum(square - self.has_bias, 1e-3)).max(axis=1)
