@@ -9,6 +9,8 @@ report of a study. No agent is trained and no state space is built: hardness is 
 
 import argparse
 import json
+import re
+import sys
 from functools import cache
 from pathlib import Path
 

@@ -29,8 +29,8 @@ from pharos.hardness import (
 from pharos.hardness.representation.network_regret import (
     POLICY_WEIGHTS,
     IdealisedNetwork,
-    NetworkLearner,
     NetworkPolicyLearner,
+    NetworkQLearner,
 )
 from pharos.observations import network_inputs, observe, representation
 from strategies import examples
@@ -45,7 +45,7 @@ def seen_by(num_states, classes=None, *, largest=math.inf, bias=1.0):
     numbers = np.arange(num_states) if classes is None else classes
     hidden = np.random.default_rng(5).random((num_states, 16))[numbers]
     last, whole = hidden @ hidden.T + 1, np.asarray(kernel_of(num_states), np.float64)[np.ix_(numbers, numbers)]
-    layer = OutputLayer(lambda x, y: last[np.ix_(x, y)], 0.5, (17, 64), (0.6, 0.4), largest, bias)
+    layer = OutputLayer(lambda x, y: last[np.ix_(x, y)], 0.5, (17, 64), (0.6, 0.4), largest, bias=bias)
     return Representation.of_matrix(whole + last, numbers, output_layer=layer)
 
 
@@ -94,7 +94,7 @@ DRAWS = {
 def test_a_walk_of_a_dqn_is_the_definition(name, draws):
     (sampling, adam, is_aliased), mdp = DRAWS[draws], WORLDS[name]()
     seen = seen_by(mdp.num_states, np.arange(mdp.num_states) // 2 if is_aliased else None)
-    _, learner, (network,), (twin,) = recorded(NetworkLearner, mdp, seen, SHORT, adam, sampling)
+    _, learner, (network,), (twin,) = recorded(NetworkQLearner, mdp, seen, SHORT, adam, sampling)
     start, classes = twin.outputs.T.copy(), numbers_of(learner)
     plain_walk(mdp, np.eye(len(start)), classes, SHORT, sampling, 7, SHORT.steps, start, 1.0, twin)
     twin.settle()  # as the target is copied at the last step, too
@@ -310,7 +310,7 @@ def test_without_a_learning_rate_policies_stay_as_they_are(measure):
 
 @pytest.mark.parametrize("bias", [0.0, 1.0])
 def test_a_network_starts_from_the_covariance_of_its_outputs_each_for_itself(bias):
-    learner = recorded(NetworkLearner, random_mdp(7, 3), seen_by(7, bias=bias), Schedule(steps=1), FAST, ONCE)[1]
+    learner = recorded(NetworkQLearner, random_mdp(7, 3), seen_by(7, bias=bias), Schedule(steps=1), FAST, ONCE)[1]
     starts = np.array([learner.network(seed, share=0.25).before for seed in range(3000)])
     expected = 0.25 * 0.5 / 16 * (learner.last - 1 + bias)
     for a in range(3):

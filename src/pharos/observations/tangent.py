@@ -197,7 +197,7 @@ def _output_layer(network: Network, shape: Sequence[int]) -> OutputLayer:
         return (tangent_kernel(network, x, y, of_outputs=True) - np.float32(bias)) / np.float32(weight) + 1
 
     largest = units + 1.0 if network.tanh and len(network.hidden) > 1 else math.inf
-    return OutputLayer(kernel, units * weight, network.parameters(shape), network.evenness, largest, bias / weight)
+    return OutputLayer(kernel, units * weight, network.parameters(shape), network.evenness, largest, bias=bias / weight)
 
 
 def _inputs_digest(inputs: Callable[[np.ndarray], np.ndarray], num_states: int) -> str:
