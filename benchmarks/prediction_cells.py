@@ -438,8 +438,8 @@ def without(grows=True, even=False):
         settle(network)
         network.net.last[:], network.net.gram[:] = last, gram
 
-    def alike(layer, kernel, weights, parameters, evenness, largest=np.inf):
-        made(layer, kernel, weights, parameters, (1.0, 1.0), largest)
+    def alike(layer, kernel, weights, parameters, evenness, *more, **named):
+        made(layer, kernel, weights, parameters, (1.0, 1.0), *more, **named)
 
     try:
         hardness.report = functools.partial(report, keep=False)
