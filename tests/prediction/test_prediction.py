@@ -120,7 +120,7 @@ def test_published_cells_are_of_many_classes_and_sets(agent):
     assert np.isfinite([known.predicted, known.observed, known.states, known.steps, known.spreads]).all()
     assert 0.74 <= known.coverage() <= 0.88
     counts = known.ordered(1.0)
-    assert counts.right / counts.pairs > 0.9  # what the words rest on
+    assert counts.right / counts.pairs > 0.8  # what the words rest on
 
 
 def test_the_common_hyperparameters_are_those_of_the_presets():
