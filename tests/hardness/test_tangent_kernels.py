@@ -322,7 +322,7 @@ def test_a_linear_network_has_a_regret(grid):
 def test_a_settled_network_has_the_products_of_its_weights(has_bias):
     """Output weights that moved along features, with and without a bias."""
     rng = np.random.default_rng(0)
-    features, weights, moved = rng.normal(size=(3, 8)), rng.normal(size=(2, 8)), rng.normal(size=(2, 3))
+    features, weights, moved = 0.2 * rng.normal(size=(3, 8)), rng.normal(size=(2, 8)), rng.normal(size=(2, 3))
     last = (features @ features.T + has_bias).astype(np.float32)
     layer = OutputLayer(lambda x, y: last, 1.0, (8 + has_bias, 0), (1.0, 0.0), has_bias=has_bias)
     network = IdealisedNetwork(last.copy(), np.zeros_like(last), 1.0, weights @ features.T, None, layer)
@@ -332,6 +332,7 @@ def test_a_settled_network_has_the_products_of_its_weights(has_bias):
     network.settle()
     after = weights + moved @ features
     np.testing.assert_allclose(network.net.gram, after @ after.T, rtol=1e-4)
+    np.testing.assert_allclose(network.net.last, last, rtol=1e-6)  # features smaller than a bias, too
     np.testing.assert_allclose(network.net.outputs - network.bias, after @ features.T, rtol=1e-4, atol=1e-5)
 
 

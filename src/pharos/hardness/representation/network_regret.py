@@ -324,7 +324,7 @@ class IdealisedNetwork:
         """Make of H and M what has been learnt since they were settled last. Infinite numbers are taken back.
 
         Outputs do not follow the Gram matrices exactly, so that these are held to what products can be: |f_a(x)|^2 <=
-        M_aa (H(x, x) - 1), H(x, y)^2 <= H(x, x) H(y, y), H(x, x) >= 1, M positive semidefinite.
+        M_aa (H(x, x) - 1), H(x, y)^2 <= H(x, x) H(y, y), H(x, x) >= 1 with biases, M positive semidefinite.
         """
         net = self.net
         f, moved, grown = self.before - self.bias, net.weights, net.grown
@@ -347,7 +347,7 @@ class IdealisedNetwork:
             shrunk = root / np.sqrt(np.maximum(np.diag(net.last), square))
             net.last[:] *= shrunk[:, None] * shrunk
         np.clip(net.last, -root[:, None] * root, root[:, None] * root, out=net.last)
-        np.fill_diagonal(net.last, np.maximum(np.diag(net.last), 1.0))  # the bias alone is 1
+        np.fill_diagonal(net.last, np.maximum(np.diag(net.last), self.has_bias))  # a bias alone is 1
         values, vectors = np.linalg.eigh((gram + gram.T) / 2)
         net.gram[:] = (vectors * np.maximum(values, 0.0)) @ vectors.T
         least = ((net.outputs - self.bias) ** 2 / np.maximum(square - self.has_bias, 1e-3)).max(axis=1)
