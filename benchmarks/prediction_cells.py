@@ -383,6 +383,12 @@ def other(resamples):
         print(f"| {agent.upper()} | `{primary_predictors()[agent]}` | {len(cells)} | {said_of(cells, resamples)} |")
         earlier = cells.assign(predicted=cells["before"])
         print(f"| {agent.upper()} | `{BEFORE[agent]}` | {len(cells)} | {said_of(earlier, resamples)} |")
+    later, _ = study.read_predictions(OTHER / "predictions-later.parquet")
+    later = later[later["agent"] == "ppo"].rename(columns={"network_policy_regret": "later"})
+    cells = frame.merge(later[[*CELL, "later"]], on=CELL)
+    change = (cells["later"] - cells["predicted"]).abs()
+    said = said_of(cells.assign(predicted=cells["later"]), resamples)
+    print(f"| PPO | mended, by {change.mean():.3f} in the mean, {change.max():.2f} at most | {len(cells)} | {said} |")
     for agent in OTHER_WIDTHS:
         cells = frame[frame["agent"] == agent]
         misses = (cells["observed"] - cells["predicted"]).groupby(cells["environment"]).mean().sort_values()

@@ -1,10 +1,11 @@
 """Which part of a DQN reacts to the unit of rewards: runs with its loss and its optimizer exchanged.
 
-    python benchmarks/unit_of_rewards.py [--predict]
+    python benchmarks/unit_of_rewards.py [--predict [--measure huber_regret]]
 
 Prints for worlds of docs/studies/sealed-2, agents and numbers that rewards are divided by the regret of three seeds and
 the deviation of a seed: the table of docs/evidence/sealed-2.md. Ten minutes of a processor. With --predict it trains
-nothing and prints what `pharos predict` says of the agent in each unit: the table of docs/evidence/sealed-3.md.
+nothing and prints what `pharos predict` says of the agent in each unit, or another measure of the idealised learner: the
+table of docs/evidence/network-regret.md.
 """
 
 import argparse
@@ -60,23 +61,24 @@ AGENTS = {
 }
 
 
-def predicted(config, unit):
-    """What is predicted of a run if rewards are divided by `unit`."""
+def predicted(config, unit, measure):
+    """What is predicted of a run if rewards are divided by `unit`. measure: None for the predictor."""
     config = {**config, "chance": {**config["chance"], "scale_rewards": float(unit)}}
-    return primary_regret(config, RunConfig.from_dict(config).task(trust=True)).value
+    return primary_regret(config, RunConfig.from_dict(config).task(trust=True), measure=measure).value
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--predict", action="store_true")
-    is_predicted = parser.parse_args().predict
+    parser.add_argument("--measure", help="in the place of the predictor")
+    arguments = parser.parse_args()
     runs = [run for run in study.specification(STUDY, trust=True).runs if run.config["agent"] == "dqn"]
     for (world, observation), units in WORLDS.items():
         cells = (run for run in runs if world in run.cell["instance"] and run.cell["observation"] == observation)
         config = next(cells).config
         task = RunConfig.from_dict(config).task(trust=True)
-        if is_predicted:
-            said = ", ".join(f"{predicted(config, unit):.2f}" for unit in units)
+        if arguments.predict:
+            said = ", ".join(f"{predicted(config, unit, arguments.measure):.2f}" for unit in units)
             print(
                 f"{world}), {observation}: divided by {', '.join(f'{unit:.3g}' for unit in units)}: {said}", flush=True
             )
