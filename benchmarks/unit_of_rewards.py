@@ -4,8 +4,8 @@
 
 Prints for worlds of docs/studies/sealed-2, agents and numbers that rewards are divided by the regret of three seeds and
 the deviation of a seed: the table of docs/evidence/sealed-2.md. Ten minutes of a processor. With --predict it trains
-nothing and prints what `pharos predict` says of the agent in each unit, or another measure of the idealised learner: the
-table of docs/evidence/network-regret.md.
+nothing and prints what `pharos predict` says of the agent in each unit, or another measure of the idealised learner:
+the table of docs/evidence/network-regret.md.
 """
 
 import argparse
