@@ -385,6 +385,8 @@ def test_what_it_is_not_defined_for_is_said(measure, monkeypatch):
         measure(chain().with_rewards(np.zeros((4, 2))), seen_by(4), **FEW)
     with pytest.raises(UndefinedMeasure, match=f"{name} is defined for episodes"):
         measure(chain(horizon=None, gamma=0.9), seen_by(4), **FEW)
+    with pytest.raises(UndefinedMeasure, match=f"{name} takes no landmarks"):
+        measure(random_mdp(7, 2), replace(seen_by(7), landmarks=3), **FEW)
     monkeypatch.setattr("pharos.hardness.representation.network_regret.MOST_OBSERVATIONS", 5)
     with pytest.raises(UndefinedMeasure, match=f"{name}: 6 different observations; it is for at most 5"):
         measure(random_mdp(7, 2), seen_by(7), **FEW)

@@ -168,9 +168,13 @@ def test_a_dqn_is_predicted_in_the_unit_that_it_is_paid_in():
 def test_another_measure_stands_in_for_unknown_networks_and_many_observations(monkeypatch):
     world = {"length": 5, "steps": 3000, "common": True}
     assert not any("predicted by" in line for line in pharos.predict("river_swim", **world).warnings)
-    monkeypatch.setattr(network_regret_module, "MOST_OBSERVATIONS", 4)
-    for agent, name in (("dqn", "huber_regret"), ("ppo", "kernel_policy_regret")):
-        answer = pharos.predict("river_swim", agent=agent, **world)
+    for agent, name, landmarks in (
+        *(("dqn", "huber_regret", 2), ("ppo", "kernel_policy_regret", 2)),
+        *(("dqn", "huber_regret", None), ("ppo", "kernel_policy_regret", None)),
+    ):
+        if landmarks is None:
+            monkeypatch.setattr(network_regret_module, "MOST_OBSERVATIONS", 4)
+        answer = pharos.predict("river_swim", agent=agent, landmarks=landmarks, **world)
         assert answer.cells[0].measure == name != answer.predictor == primary_predictors()[agent]
         (line,) = (line for line in answer.warnings if "predicted by" in line)
         assert f"predicted by {name}, as {answer.predictor} is for at most" in line

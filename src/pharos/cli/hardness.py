@@ -272,7 +272,8 @@ def predict(
         preset: Use the hyperparameters of the published cells, for which the interval is calibrated. --set overrides
             them.
         horizon: Steps of an episode. Default: the environment's time limit.
-        landmarks: Landmarks of the kernel approximation. 0 turns it off. Default: only above 2,048 observations.
+        landmarks: Landmarks of the kernel approximation, for the predictors of before. Default: only above 4,096
+            observations.
         plot: Draw the bars into a PNG, PDF or SVG file.
     """
     env = target.found_environment()

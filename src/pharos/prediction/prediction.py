@@ -226,7 +226,7 @@ def predict(
         networks: as for `pharos.observations.representation`, such as "mlp64x2" or a function of an input's shape that
             returns a torch.nn.Module. With several, each is used with each observation. Default: the agent's own.
         steps: of training.
-        landmarks: as for `representation`.
+        landmarks: as for `representation`. With some, the measures of before stand in for the predictors.
         common: use the hyperparameters of the published cells, in place of the class's.
         pilot: train one seed of the real agent for this share of the steps (0.1, 0.25 or 0.5), too. Values and
             intervals are then of the pilot and the idealised learner together.
@@ -402,8 +402,8 @@ def _stand_ins(agent: str, cells: Iterable[PredictedRegret]) -> Iterable[str]:
     for measure in dict.fromkeys(cell.measure for cell in cells if cell.measure != predictor):
         labels = ", ".join(cell.label for cell in cells if cell.measure == measure)
         yield (
-            f"{labels}: predicted by {measure}, as {predictor} is for at most 4,096 different observations, and "
-            "networks whose output layer is known; the interval is not calibrated here"
+            f"{labels}: predicted by {measure}, as {predictor} is for at most 4,096 different observations without "
+            "landmarks, and networks whose output layer is known; the interval is not calibrated here"
         )
 
 

@@ -131,8 +131,9 @@ def network_regret(
     Returns:
         A NetworkRegret. The same seed gives the same number. The unit of rewards matters, as it does to a DQN.
     Raises:
-        UndefinedMeasure: the representation's output layer is not known, it has more than MOST_OBSERVATIONS different
-            observations, there is neither a horizon nor a time limit, or uniform play is optimal.
+        UndefinedMeasure: the representation's output layer is not known, it has landmarks or more than
+            MOST_OBSERVATIONS different observations, there is neither a horizon nor a time limit, or uniform play is
+            optimal.
         ParameterError: the representation is of other states, or its kernel does not fit into memory.
     Cost: 8 C^2 bytes of C different observations and 4 C^2 a walk. A gradient step takes O((|B| + A^2) C), a copy of
         the target O(A C^2). 0.1 s a walk of 30 thousand steps for 30 observations, 0.5 s for 400.
@@ -183,7 +184,7 @@ def network_policy_regret(
 def is_for_networks(representation: Representation) -> bool:
     """Whether `network_regret` takes a representation, as far as that shows before the states of episodes are known."""
     numbers = int(representation.classes.max(initial=-1)) + 1
-    return representation.output_layer is not None and numbers <= MOST_OBSERVATIONS
+    return representation.output_layer is not None and numbers <= MOST_OBSERVATIONS and not representation.landmarks
 
 
 def schedule_of(learner: SampledLearner) -> dict[str, Any]:
@@ -211,6 +212,8 @@ class NetworkQLearner(SampledLearner):
                 f"{self.measure} needs a network whose output layer is known: take a representation of "
                 "pharos.observations, and if the network is a function's, let it end with a torch.nn.Linear"
             )
+        if self.representation.landmarks:
+            raise UndefinedMeasure(f"{self.measure} takes no landmarks: leave them out, or give 0")
         if count > MOST_OBSERVATIONS:
             raise UndefinedMeasure(
                 f"{self.measure}: {count:,} different observations; it is for at most {MOST_OBSERVATIONS:,}, as its "
