@@ -11,7 +11,14 @@ import numpy as np
 from pharos.kernels.bellman import set_has
 from pharos.kernels.idealised_network import adam_step, add_error, squared_gradients
 from pharos.kernels.kernel_cache import inlined, kernel
-from pharos.kernels.stepping import integer_below, normal_number, redrawn_action, start_by_number, uniform_number
+from pharos.kernels.stepping import (
+    integer_below,
+    normal_number,
+    outcome_of_row,
+    redrawn_action,
+    start_by_number,
+    uniform_number,
+)
 
 
 class Rollout(NamedTuple):
@@ -87,12 +94,7 @@ def play(outcomes, group, episodes, actor, critic, rollout, discounts):
             rollout.log_probabilities[i], values[t] = logits[action, c] - normaliser, value_of[c]
             # step
             executed = redrawn_action(action, rollout.previous[e], chance, num_actions, word, c)
-            row = s * num_actions + executed
-            k, last = offsets[row], offsets[row + 1] - 1
-            if k < last:
-                u = uniform_number(word, 0)
-                while k < last and u >= cumulative_probabilities[k]:
-                    k += 1
+            k = outcome_of_row(offsets, cumulative_probabilities, s * num_actions + executed, word)
             state = next_states[k]
             rewards[t] = outcome_rewards[k] + (deviation * normal_number(noise_word, 0) if deviation > 0.0 else 0.0)
             rollout.elapsed[e] += 1

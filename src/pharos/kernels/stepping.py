@@ -581,6 +581,17 @@ class Walk(NamedTuple):
     minibatch: tuple[np.ndarray, ...]
 
 
+@inlined
+def outcome_of_row(offsets, cumulative, row, word):
+    """The number of an outcome of a row, drawn from the stream word (1,); nothing is drawn if there is one."""
+    k, last = offsets[row], offsets[row + 1] - 1
+    if k < last:
+        u = uniform_number(word, 0)
+        while k < last and u >= cumulative[k]:
+            k += 1
+    return k
+
+
 @kernel(makes_arrays=False)
 def learn(outcomes, group, episodes, values, walk, schedule, steps):
     """`steps` steps of an epsilon-greedy walk, with gradient steps on minibatches of its transitions.
@@ -617,12 +628,7 @@ def learn(outcomes, group, episodes, values, walk, schedule, steps):
         action = _act(kernel, learned, chance, c, epsilon, word, num_actions)
         visits[c, action] += 1
         executed = redrawn_action(action, cursor[1], chance, num_actions, word, c)
-        row = s * num_actions + executed
-        k, last = offsets[row], offsets[row + 1] - 1
-        if k < last:
-            u = uniform_number(word, 0)
-            while k < last and u >= cumulative_probabilities[k]:
-                k += 1
+        k = outcome_of_row(offsets, cumulative_probabilities, s * num_actions + executed, word)
         next_state = next_states[k]
         ended = next_state < 0 or terminal[next_state]
         # remember the transition, and go on
