@@ -344,6 +344,10 @@ def test_what_cannot_be_predicted_is_one_line(monkeypatch):
         pharos.predict("river_swim", steps=500)
     with pytest.raises(ParameterError, match="steps is 500, but the first rollout ends after 511 steps"):
         pharos.predict("river_swim", steps=500, agent="ppo")
+    with pytest.raises(
+        ParameterError, match=r"learning_rate is 'lin_0\.1'; expected a number, as predictions are of one"
+    ):
+        pharos.predict("river_swim", length=5, hyperparameters={"learning_rate": "lin_0.1"})
     with pytest.raises(ParameterError, match="no observation to predict for"):
         pharos.predict("river_swim", [])
     with pytest.raises(ParameterError, match="of episodes of some number of steps; found horizon none"):

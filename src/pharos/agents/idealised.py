@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pharos.errors import ParameterError
+
 if TYPE_CHECKING:
     from pharos.hardness import Adam, Result, Rollouts, Schedule
     from pharos.mdp import TabularMDP
@@ -243,10 +245,17 @@ class IdealisedActorCritic(Idealised):
 
 
 def _adam(hyperparameters: Mapping[str, Any], **defaults: float) -> "Adam":
-    """Adam of an agent. defaults: of Stable-Baselines3, if its hyperparameters do not say."""
+    """Adam of an agent. defaults: of Stable-Baselines3, if its hyperparameters do not say.
+
+    Raises:
+        ParameterError: the learning rate is a schedule.
+    """
     from pharos.hardness import Adam
 
     own = {name: hyperparameters[name] for name in ("learning_rate", "max_grad_norm") if name in hyperparameters}
+    for name, value in own.items():
+        if not isinstance(value, int | float):
+            raise ParameterError(f"{name} is {value!r}; expected a number, as predictions are of one that stays")
     return Adam(**{**defaults, **{name: float(value) for name, value in own.items()}})
 
 
