@@ -127,8 +127,11 @@ class IdealisedDQN(Idealised):
     def columns(self, config: Configuration, mdp: "TabularMDP", options: Mapping[str, Any]) -> dict[str, Any]:
         sampled = self.result("sampled_regret", config, mdp, options).value
         row = _parts(SAMPLED_PREDICTORS, sampled)
-        for measure in dict.fromkeys((self.fallback, self.primary(config, mdp, options).name)):
-            row |= self.primary_columns(measure, self.result(measure, config, mdp, options).value)
+        results = [self.primary(config, mdp, options)]
+        if results[0].name != self.fallback:
+            results.append(self.result(self.fallback, config, mdp, options))
+        for result in results:
+            row |= self.primary_columns(result.name, result.value)
         return row
 
     def result(self, measure: str, config: Configuration, mdp: "TabularMDP", options: Mapping[str, Any]) -> "Result":
@@ -195,10 +198,9 @@ class IdealisedActorCritic(Idealised):
         rollouts, hyperparameters = self.rollouts(config), config["hyperparameters"]
         if measure != self.predictor:
             return self._kernel_result(config, mdp, rollouts, options)
-        environments = int(hyperparameters.get("n_envs", 1))
         rollouts = replace(
             rollouts,
-            environments=environments,
+            environments=int(hyperparameters.get("n_envs", 1)),
             epochs=int(hyperparameters.get("n_epochs", 1)),
             entropy_weight=float(hyperparameters.get("ent_coef", 0.0)),
             value_weight=float(hyperparameters.get("vf_coef", 0.5)),

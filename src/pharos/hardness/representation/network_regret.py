@@ -141,7 +141,7 @@ def network_regret(
     """
     learner = NetworkQLearner(mdp, representation, schedule, horizon, solution, progress)
     learner.sampling, learner.adam = sampling or Sampling(), adam or Adam()
-    return learner.measured_in_network({"schedule": schedule_of(learner)})
+    return learner.measured_in_network({"schedule": learner.schedule_settings()})
 
 
 @require_mdp
@@ -187,11 +187,6 @@ def is_for_networks(representation: Representation) -> bool:
     return representation.output_layer is not None and numbers <= MOST_OBSERVATIONS and not representation.landmarks
 
 
-def schedule_of(learner: SampledLearner) -> dict[str, Any]:
-    """The schedule of a learner, JSON-able. Its optimizer does not count."""
-    return {name: value for name, value in asdict(learner.schedule).items() if name != "optimizer"}
-
-
 class NetworkQLearner(SampledLearner):
     """A DQN in an idealised network. Base class of that of a PPO."""
 
@@ -224,11 +219,10 @@ class NetworkQLearner(SampledLearner):
         self.last = np.asarray(layer.kernel(observed, observed), np.float32)
         whole = np.asarray(self.representation.kernel(observed, observed), np.float32)
         self.beneath = (whole - self.last) / np.float32(layer.weights)
-        seeds = range(self.sampling.seed, self.sampling.seed + self.sampling.walks)
-        steps, walks = self.steps(), [list(self.regrets(seed)) for seed in seeds]
+        walks = [list(self.regrets(seed)) for seed in self.seeds]
         conventions = self.conventions({**settings, "sampling": self.sampling.to_dict(), "adam": asdict(self.adam)}, {})
         return NetworkRegret(
-            curve=SampledCurve(steps, np.array(walks), self.worst),
+            curve=SampledCurve(self.steps(), np.array(walks), self.worst),
             tabular=self.with_a_table(),
             diverged=self.diverged,
             observations=count,
@@ -236,10 +230,6 @@ class NetworkQLearner(SampledLearner):
             conventions={**conventions, "step_size": "Adam's, by its learning rate"},
             name=self.measure,
         )
-
-    def steps(self) -> np.ndarray:
-        """(J,) at which walks are evaluated."""
-        return np.unique(np.round(np.linspace(0, self.schedule.steps, LOOKS + 1)).astype(np.int64))
 
     def with_a_table(self) -> float:
         """Mean regret with a table in the place of the network."""
@@ -390,22 +380,20 @@ class NetworkPolicyLearner(NetworkQLearner, PolicyLearner):
         far = math.inf if rollouts.clip_range is None else rollouts.clip_range
         settings = (epochs, size, far, *weights, self.adam.max_grad_norm)
         discounts = float(self.schedule.gamma), float(rollouts.gae_lambda)
-        for step in range(0, self.schedule.steps + rollouts.steps, rollouts.steps):
-            now = min(step, self.schedule.steps)
-            self.report(f"step {now:,} of {self.schedule.steps:,} of a walk")
+        end = self.schedule.steps
+        for step in [*range(0, end, rollouts.steps), end]:
+            self.report(f"step {step:,} of {end:,} of a walk")
             actor.settle()
             critic.settle()
             is_finite = actor.is_finite and critic.is_finite
-            if now in looks:
+            if step in looks:
                 policy = softmax(observations.masked(actor.net.outputs.T))[observations.groups]
                 yield self.regret(self.value(policy))
-            if now < self.schedule.steps and is_finite:
+            if step < end and is_finite:
                 kernels.play(self.outcomes, group, episodes, actor.net, critic.net, rollout, discounts)
                 kernels.learn_from_rollout(
                     episodes.chance, actor.net, critic.net, rollout, settings, actor.constants[0], critic.constants[0]
                 )
-            if now == self.schedule.steps:
-                break
         self.diverged += not is_finite
 
     def first_rollout(self, seed: int) -> "Rollout":

@@ -260,8 +260,7 @@ class SampledLearner(IdealisedLearner):
         operators, landmarks = self.operators()
         (descent, adam), *half = map(self.both, operators)
         error = sum((abs(descent.mean + adam.mean - one.mean - other.mean) / 2 for one, other in half), 0.0)
-        of_schedule = {name: value for name, value in asdict(self.schedule).items() if name != "optimizer"}
-        settings = {"schedule": of_schedule, "sampling": sampling.to_dict()}
+        settings = {"schedule": self.schedule_settings(), "sampling": sampling.to_dict()}
         conventions = self.conventions(settings, {"greedy": self.worst} if math.isfinite(self.worst) else {})
         conventions["step_size"] += ", at most what a minibatch bears"
         return SampledRegret(
@@ -283,11 +282,23 @@ class SampledLearner(IdealisedLearner):
         root.preconditioned(np.full(len(observations), 1 / len(observations)))
         return self.curve_of_walks(observations, operator), self.curve_of_walks(observations, root)
 
+    def steps(self) -> np.ndarray:
+        """(J,) at which walks are evaluated."""
+        return np.unique(np.round(np.linspace(0, self.schedule.steps, LOOKS + 1)).astype(np.int64))
+
+    @property
+    def seeds(self) -> range:
+        """Seeds of the walks."""
+        return range(self.sampling.seed, self.sampling.seed + self.sampling.walks)
+
+    def schedule_settings(self) -> dict[str, Any]:
+        """The schedule, JSON-able. Its optimizer does not count."""
+        return {name: value for name, value in asdict(self.schedule).items() if name != "optimizer"}
+
     def curve_of_walks(self, observations: Grouped, operator: KernelOperator) -> SampledCurve:
         """The regret of all walks, with a kernel over the observations."""
-        steps = np.unique(np.round(np.linspace(0, self.schedule.steps, LOOKS + 1)).astype(np.int64))
-        seeds = range(self.sampling.seed, self.sampling.seed + self.sampling.walks)
-        walks = (self.walk(observations, operator, steps, seed) for seed in seeds)
+        steps = self.steps()
+        walks = (self.walk(observations, operator, steps, seed) for seed in self.seeds)
         regrets = np.array([[self._regret_of(q, observations) for q in walk] for walk in walks])
         return SampledCurve(steps, regrets, self.worst)
 
