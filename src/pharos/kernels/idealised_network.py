@@ -122,3 +122,21 @@ def adam_step(net, of_last, of_beneath, share, optimizer):
         for a in range(num_outputs):
             net.error[a, c] = 0.0
     net.live[-1] = 0
+
+
+@kernel
+def move_kernel(last, left, right, shrunk, root, least):
+    """H += left' right + right' left, times shrunk(x) shrunk(y), held to +- root(x) root(y), H(x, x) to `least`.
+
+    All of them float32. One pass over H, which remains symmetric to the last bit.
+    """
+    num_outputs, count = left.shape
+    for x in range(count):
+        row = last[x]
+        for a in range(num_outputs):
+            for y in range(count):
+                row[y] += left[a, x] * right[a, y] + right[a, x] * left[a, y]
+        for y in range(count):
+            bound = root[x] * root[y]
+            row[y] = min(max(row[y] * (shrunk[x] * shrunk[y]), -bound), bound)
+        row[x] = max(row[x], least)  # a bias alone is 1

@@ -317,30 +317,29 @@ class IdealisedNetwork:
         """Make of H and M what has been learnt since they were settled last. Infinite numbers are taken back.
 
         Outputs do not follow the Gram matrices exactly, so that these are held to what products can be: |f_a(x)|^2 <=
-        M_aa (H(x, x) - 1), H(x, y)^2 <= H(x, x) H(y, y), H(x, x) >= 1 with biases, M positive semidefinite.
+        M_aa (H(x, x) - 1), H(x, y)^2 <= H(x, x) H(y, y), H(x, x) >= 1 with biases, M positive semidefinite. Features
+        that saturate (hyperbolic tangents) shrink H as a whole.
         """
+        from pharos.kernels.idealised_network import move_kernel
+
         net = self.net
         f, moved, grown = self.before - self.bias, net.weights, net.grown
         with np.errstate(over="ignore", invalid="ignore"):
             total = self.has_bias * moved.sum(axis=1, keepdims=True)  # of the biases
             product = moved @ f.T
-            by_features = (grown.T @ (f + net.gram @ grown / 2)).astype(np.float32)
-            gram = net.gram + product + product.T + moved @ (net.last @ moved.T) - total @ total.T
-            by_features += by_features.T
-        parts = (net.outputs, gram, by_features)
-        if not (self.is_finite and all(np.isfinite(each).all() for each in parts)):
+            gram = net.gram + product + product.T - total @ total.T
+            gram += moved @ (net.last @ moved.T.astype(np.float32))
+            left, right = (each.astype(np.float32) for each in (grown, f + net.gram @ grown / 2))
+            largest = 2 * len(left) * np.abs(left).max(initial=0) * np.abs(right).max(initial=0)  # that H moves by
+        if not (self.is_finite and all(np.isfinite(each).all() for each in (net.outputs, gram, largest))):
             self.is_finite = False
             net.outputs[:] = self.before
             return
-        net.last[:] += by_features
         self.bias += total
-        square = np.minimum(np.maximum(np.diag(net.last), self.has_bias), self.largest)
-        root = np.sqrt(square).astype(np.float32)
-        if math.isfinite(self.largest):  # hyperbolic tangents saturate
-            shrunk = root / np.sqrt(np.maximum(np.diag(net.last), square))
-            net.last[:] *= shrunk[:, None] * shrunk
-        np.clip(net.last, -root[:, None] * root, root[:, None] * root, out=net.last)
-        np.fill_diagonal(net.last, np.maximum(np.diag(net.last), self.has_bias))  # a bias alone is 1
+        reached = np.diag(net.last) + 2 * (left * right).sum(axis=0)
+        square = np.minimum(np.maximum(reached, self.has_bias), self.largest).astype(np.float32)
+        shrunk = np.sqrt(np.divide(square, reached, out=np.ones_like(square), where=reached > square))
+        move_kernel(net.last, left, right, shrunk, np.sqrt(square), np.float32(self.has_bias))
         values, vectors = np.linalg.eigh((gram + gram.T) / 2)
         net.gram[:] = (vectors * np.maximum(values, 0.0)) @ vectors.T
         least = ((net.outputs - self.bias) ** 2 / np.maximum(square - self.has_bias, 1e-3)).max(axis=1)
