@@ -38,6 +38,8 @@ CASES = {
     "frozen_lake-16/vector": ("frozen_lake", {"size": 16, "seed": 0}, "vector"),
     "taxi-4/vector": ("taxi", {"size": 4}, "vector"),
     "taxi-4/simple_image": ("taxi", {"size": 4}, "simple_image"),
+    "taxi-6/vector": ("taxi", {"size": 6}, "vector"),
+    "taxi-8/vector": ("taxi", {"size": 8}, "vector"),
     "taxi-10/vector": ("taxi", {"size": 10}, "vector"),
     "taxi-10/simple_image": ("taxi", {"size": 10}, "simple_image"),
     "taxi-32/vector": ("taxi", {"size": 32}, "vector"),

@@ -11,6 +11,7 @@
     python benchmarks/prediction_cells.py draw [--cells cells.csv] [--picture docs/images/sealed.png]
     python benchmarks/prediction_cells.py other [--picture docs/images/other-classes.png]
     python benchmarks/prediction_cells.py ablations [--cells ablations.csv]
+    python benchmarks/prediction_cells.py walks [--cells cells.csv] [--block NAME ...]
     python benchmarks/prediction_cells.py units [--cells cells.csv]
     python benchmarks/prediction_cells.py cost
 
@@ -26,7 +27,8 @@ set what such widths hold. `sealed` prints the same of the second sealed test, b
 interval of before it held. `collect` puts predictions and packed runs of the third one into its table of cells. `third`
 prints its result, `huber_regret` beside `sampled_regret`, and what is missed by the unit of rewards. `other` prints the
 result of the ten classes of other-classes, and draws it. `ablations` computes the primary predictors with one part left
-out, on vectors and hashes of the second and third sealed set, and judges them. `pilots` prints how well a seed that is
+out, on vectors and hashes of the second and third sealed set, and judges them. `walks` judges means of fewer and of
+more walks of the idealised networks, which takes an hour. `pilots` prints how well a seed that is
 cut after a share of its steps predicts others in both last sets, with the measure and without. `draw` draws predicted
 against observed regret of the third sealed set. `cost` prints the seconds of a cell and the memory that it adds, each
 in a process of its own that has compiled, by states of a grid, agent and observation.
@@ -356,9 +358,13 @@ def other_cells():
     cells = frame.merge(observed[[*CELL, "observed", "seeds", "spread"]], on=CELL).rename(
         columns={"num_states": "states"}
     )
-    columns = [cells[name].where(cells["agent"] == agent, 0.0) for agent, name in primary_predictors().items()]
-    cells = cells.assign(study="other-classes", steps=30_000, predicted=sum(columns))
+    cells = cells.assign(study="other-classes", steps=30_000, predicted=primary_columns(cells))
     return cells.merge(pd.read_csv(OTHER / "before.csv"), on=CELL)
+
+
+def primary_columns(cells):
+    """The primary predictor of each cell's agent."""
+    return sum(cells[name].where(cells["agent"] == agent, 0.0) for agent, name in primary_predictors().items())
 
 
 def before_of_other():
@@ -384,11 +390,13 @@ def other(resamples):
         earlier = cells.assign(predicted=cells["before"])
         print(f"| {agent.upper()} | `{BEFORE[agent]}` | {len(cells)} | {said_of(earlier, resamples)} |")
     later, _ = study.read_predictions(OTHER / "predictions-later.parquet")
-    later = later[later["agent"] == "ppo"].rename(columns={"network_policy_regret": "later"})
-    cells = frame.merge(later[[*CELL, "later"]], on=CELL)
-    change = (cells["later"] - cells["predicted"]).abs()
-    said = said_of(cells.assign(predicted=cells["later"]), resamples)
-    print(f"| PPO | mended, by {change.mean():.3f} in the mean, {change.max():.2f} at most | {len(cells)} | {said} |")
+    cells = frame.merge(later.assign(later=primary_columns(later))[[*CELL, "later"]], on=CELL)
+    for agent, words in (("dqn", "eight walks"), ("ppo", "eight walks, mended")):
+        of_agent = cells[cells["agent"] == agent]
+        change = (of_agent["later"] - of_agent["predicted"]).abs()
+        said = said_of(of_agent.assign(predicted=of_agent["later"]), resamples)
+        words = f"{words}: by {change.mean():.3f} in the mean, {change.max():.2f} at most"
+        print(f"| {agent.upper()} | {words} | {len(of_agent)} | {said} |")
     for agent in OTHER_WIDTHS:
         cells = frame[frame["agent"] == agent]
         misses = (cells["observed"] - cells["predicted"]).groupby(cells["environment"]).mean().sort_values()
@@ -455,6 +463,53 @@ def without(grows=True, even=False):
     finally:
         network_regret.IdealisedNetwork.settle, hardness.report = settle, report
         learning.OutputLayer.__init__ = made
+
+
+NUMBERS_OF_WALKS = 1, 2, 3, 4, 6, 8, 12
+
+
+def walks(file, blocks, resamples):
+    """Primary predictors as the mean of fewer and of more walks, the first ones of each cell."""
+    frame, of_cells = pd.read_csv(file), {}
+    with each_walk(max(NUMBERS_OF_WALKS)) as values:
+        for block in blocks:
+            published = {tuple(row) for row in frame.loc[frame["study"] == block, CELL].to_numpy()}
+            for run in study.specification(BLOCKS[block][0], trust=True).runs:
+                key = tuple({**run.cell, "agent": run.config["agent"]}.values())
+                if key in published and (block, *key) not in of_cells:
+                    primary_regret(run.config, RunConfig.from_dict(run.config).task(trust=True, strict=True))
+                    of_cells[block, *key] = values.pop()
+                    print(len(of_cells), *key, *np.round(of_cells[block, *key], 2), flush=True)
+    frame = frame[frame["study"].isin(blocks)]
+    columns = np.array([of_cells[tuple(row)] for row in frame[["study", *CELL]].to_numpy()]).T
+    for agent in primary_predictors():
+        is_of_agent = frame["agent"] == agent
+        for number in NUMBERS_OF_WALKS:
+            cells = frame.assign(predicted=columns[:number].mean(axis=0))[is_of_agent]
+            if len(cells):
+                luck = columns[:, is_of_agent].var(axis=0, ddof=1).mean() / number
+                share = luck / ((cells["observed"] - cells["predicted"]) ** 2).mean()
+                print(f"| {agent.upper()} | {number} | {len(cells)} | {said_of(cells, resamples)} | {share:.2f} |")
+
+
+@contextlib.contextmanager
+def each_walk(number):
+    """A list to which measures of idealised networks append the values of so many walks; nothing is kept."""
+    from pharos.hardness.representation.network_regret import NetworkQLearner
+
+    measured, report, few, values = NetworkQLearner.measured_in_network, hardness.report, hardness.NETWORK_WALKS, []
+
+    def told(learner, settings):
+        result = measured(learner, settings)
+        values.append(result.curve.walks)
+        return result
+
+    try:
+        hardness.report, hardness.NETWORK_WALKS = functools.partial(report, keep=False), number
+        NetworkQLearner.measured_in_network = told
+        yield values
+    finally:
+        hardness.report, hardness.NETWORK_WALKS, NetworkQLearner.measured_in_network = report, few, measured
 
 
 def units(frame):
@@ -652,7 +707,7 @@ def main():
         "task",
         choices=(
             *("compute", "judge", "orders", "held", "sealed", "collect", "third", "pilots", "draw", "cost"),
-            *("other", "ablations", "units"),
+            *("other", "ablations", "walks", "units"),
         ),
     )
     parser.add_argument("--out", type=Path, default=CELLS_FILE)
@@ -691,6 +746,8 @@ def main():
         draw(other_cells(), STUDIES.parent / "images" / "other-classes.png")
     elif arguments.task == "units":
         units(pd.read_csv(arguments.cells))
+    elif arguments.task == "walks":
+        walks(arguments.cells, arguments.block or [*BLOCKS], arguments.resamples)
     elif arguments.task == "ablations":
         ablations(arguments.cells, arguments.resamples)
     else:

@@ -348,6 +348,15 @@ def test_a_seed_gives_its_number_and_another_another(measure):
 
 
 @BOTH
+def test_eight_walks_are_taken_and_three_of_them_with_a_table(measure):
+    taken = measure(random_mdp(7, 2), seen_by(7), adam=FAST, schedule=SHORT)
+    three = measure(random_mdp(7, 2), seen_by(7), adam=FAST, schedule=SHORT, sampling=Sampling(walks=3))
+    assert len(taken.curve.greedy) == hardness.NETWORK_WALKS == 8
+    np.testing.assert_array_equal(taken.curve.greedy[:3], three.curve.greedy)
+    assert taken.tabular == three.tabular
+
+
+@BOTH
 @pytest.mark.parametrize("noise", [0.0, 0.5])
 def test_a_scale_of_rewards_is_another_unit_of_them(measure, noise):
     mdp, sampling = random_mdp(7, 2), replace(FEW["sampling"], reward_noise=noise)

@@ -135,15 +135,15 @@ class IdealisedDQN(Idealised):
         return row
 
     def result(self, measure: str, config: Configuration, mdp: "TabularMDP", options: Mapping[str, Any]) -> "Result":
-        from pharos.hardness import Sampling, report
+        from pharos.hardness import NETWORK_WALKS, Sampling, report
 
         hyperparameters, chance = config["hyperparameters"], config["chance"]
         sizes = {name: int(hyperparameters[name]) for name in ("batch_size", "buffer_size") if name in hyperparameters}
-        sampling = Sampling(**_paid(chance), **sizes)
-        adam: dict[str, Any] = {}
+        drawn: dict[str, Any] = {"sampling": Sampling(**_paid(chance), **sizes)}
         if measure == self.predictor:
-            adam["adam"] = _adam(hyperparameters, max_grad_norm=10.0)
-        return report(mdp, [measure], schedule=self.schedule(config), sampling=sampling, **adam, **options)[measure]
+            drawn["sampling"] = replace(drawn["sampling"], walks=NETWORK_WALKS)
+            drawn["adam"] = _adam(hyperparameters, max_grad_norm=10.0)
+        return report(mdp, [measure], schedule=self.schedule(config), **drawn, **options)[measure]
 
     def primary_columns(self, measure: str, value: Mapping[str, Any] | None) -> dict[str, Any]:
         if measure == self.fallback:
@@ -193,7 +193,7 @@ class IdealisedActorCritic(Idealised):
         return row
 
     def result(self, measure: str, config: Configuration, mdp: "TabularMDP", options: Mapping[str, Any]) -> "Result":
-        from pharos.hardness import Sampling, report
+        from pharos.hardness import NETWORK_WALKS, Sampling, report
 
         rollouts, hyperparameters = self.rollouts(config), config["hyperparameters"]
         if measure != self.predictor:
@@ -206,7 +206,8 @@ class IdealisedActorCritic(Idealised):
             value_weight=float(hyperparameters.get("vf_coef", 0.5)),
         )
         adam = _adam(hyperparameters, max_grad_norm=0.5, epsilon=1e-5)
-        drawn: dict[str, Any] = {"rollouts": rollouts, "sampling": Sampling(**_paid(config["chance"])), "adam": adam}
+        sampling = Sampling(walks=NETWORK_WALKS, **_paid(config["chance"]))
+        drawn: dict[str, Any] = {"rollouts": rollouts, "sampling": sampling, "adam": adam}
         return report(mdp, [measure], schedule=self._steps(config), **drawn, **options)[measure]
 
     def _steps(self, config: Configuration) -> "Schedule":

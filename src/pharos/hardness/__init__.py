@@ -42,6 +42,7 @@ from pharos.hardness.representation.learning import (
     Schedule,
 )
 from pharos.hardness.representation.network_regret import (
+    NETWORK_WALKS,
     NetworkRegret,
     is_for_networks,
     network_policy_regret,
@@ -77,6 +78,7 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
+    "NETWORK_WALKS",
     "Adam",
     "Certified",
     "EffectiveHorizon",

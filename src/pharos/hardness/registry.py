@@ -480,7 +480,7 @@ register(
     "idealised network, whose output layer and layers beneath learn by the agent's own steps of Adam. And the same of "
     "a table",
     source="pharos; after Mnih et al. (2015), Kingma and Ba (2015), Jacot et al. (2018)",
-    **_REPRESENTATION,
+    **_REPRESENTATION | {"version": 2},
 )
 register(
     "network_policy_regret",
@@ -488,7 +488,7 @@ register(
     definition="mean over learning of (V* - V of the policy) / (V* - V of uniform play) of a PPO in two idealised "
     "networks, whose output layers and layers beneath learn by the agent's own steps of Adam. And the same of a table",
     source="pharos; after Schulman et al. (2016, 2017), Kingma and Ba (2015), Jacot et al. (2018)",
-    **_REPRESENTATION,
+    **_REPRESENTATION | {"version": 2},
 )
 register(
     "kernel_learning_time",

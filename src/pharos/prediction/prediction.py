@@ -29,7 +29,7 @@ TAKEN = {
     "horizon",
     "hyperparameters",
 }  # of TrainingOptions
-NETWORKS_IN_ORDER = OrderCounts(pairs=16, right=10, clear_pairs=16, clear_right=10)
+NETWORKS_IN_ORDER = OrderCounts(pairs=16, right=5, clear_pairs=16, clear_right=5)
 """Pairs of a DQN's networks, three widths and depths behind each of ten observations, whose regrets differ:
 benchmarks/prediction_choices.py.
 """
@@ -109,7 +109,7 @@ class PairOrder:
         if self.of_networks:
             return (
                 f"{easier} or {harder}: not to be called, as predictions ordered networks rightly in "
-                f"{counts.clear_right} of {counts.clear_pairs} pairs only"
+                f"{counts.clear_right} of {counts.clear_pairs} pairs"
             )
         if self.is_called:
             return (

@@ -30,6 +30,10 @@ from pharos.solvers import Solution
 if TYPE_CHECKING:
     from pharos.kernels.actor_critic import Rollout
 
+NETWORK_WALKS = 8
+"""Walks of which the mean is taken: more predict the published cells no better (docs/evidence/network-regret.md)."""
+TABLE_WALKS = 3
+"""Those of them that are walked with a table in the place of the network, too."""
 MOST_OBSERVATIONS = 4096
 """Different observations of an idealised network: its kernels are matrices."""
 POLICY_WEIGHTS = 0.01**2
@@ -41,7 +45,8 @@ class NetworkRegret:
     """Regret of an agent in an idealised network.
 
     Attributes:
-        curve: of each walk, at evaluations at equal distances. tabular: the mean regret of the same agent with a table.
+        curve: of each walk, at evaluations at equal distances.
+        tabular: the mean regret of the same agent with a table. A DQN's is of TABLE_WALKS walks at most.
         diverged: walks in which values or logits became infinite. They keep their last policy before that.
         observations: different ones that it learns from. states: that can be met and are not terminal.
         conventions: schedule, sampling, optimizer, episode, observation and network.
@@ -123,8 +128,8 @@ def network_regret(
 
     Args:
         representation: with `output_layer` and `covariance`, see `pharos.observations.representation`.
-        schedule: Default: the default of `Schedule`. sampling: None: the default of `Sampling`.
-        adam: None: the default of `Adam`.
+        schedule: Default: the default of `Schedule`. sampling: None: the default of `Sampling`, with NETWORK_WALKS
+            walks. adam: None: the default of `Adam`.
         solution: the optimal values of `mdp`, if they are known.
         horizon: steps of an episode that the learner sees. Default: the MDP's, else the time limit.
         progress: called with a line now and then. An exception that it raises ends the computation.
@@ -140,7 +145,7 @@ def network_regret(
     Source: pharos; Mnih et al. (2015), Kingma and Ba (2015), and Jacot et al. (2018) for the kernels.
     """
     learner = NetworkQLearner(mdp, representation, schedule, horizon, solution, progress)
-    learner.sampling, learner.adam = sampling or Sampling(), adam or Adam()
+    learner.sampling, learner.adam = sampling or Sampling(walks=NETWORK_WALKS), adam or Adam()
     return learner.measured_in_network({"schedule": learner.schedule_settings()})
 
 
@@ -169,13 +174,13 @@ def network_policy_regret(
     Args:
         representation: as for `network_regret`, of an actor-critic `initialisation="sb3"`.
         schedule: for its steps and discount. rollouts: None: the defaults of `Rollouts`, with clip_range 0.2.
-        sampling: for its walks, seed, and noise and scale of rewards.
+        sampling: for its walks (None: NETWORK_WALKS), seed, and noise and scale of rewards.
         adam, solution, horizon, progress: as for `network_regret`.
     Returns, raises, cost: as for `network_regret`.
     Source: pharos; Schulman et al. (2016, 2017), Kingma and Ba (2015).
     """
     learner = NetworkPolicyLearner(mdp, representation, schedule, horizon, solution, progress)
-    learner.sampling, learner.adam = sampling or Sampling(), adam or Adam()
+    learner.sampling, learner.adam = sampling or Sampling(walks=NETWORK_WALKS), adam or Adam()
     learner.rollouts = rollouts or Rollouts(clip_range=0.2)
     of_schedule = {name: getattr(learner.schedule, name) for name in ("steps", "gamma")}
     return learner.measured_in_network({"schedule": of_schedule, "rollouts": learner.rollouts.to_dict()})
@@ -233,7 +238,7 @@ class NetworkQLearner(SampledLearner):
 
     def with_a_table(self) -> float:
         """Mean regret with a table in the place of the network."""
-        return self.curve_of_walks(self.table, Identity()).mean
+        return self.curve_of_walks(self.table, Identity(), self.seeds[:TABLE_WALKS]).mean
 
     def regrets(self, seed: int) -> Iterator[float]:
         """Yield the regret of a walk at each of `steps`."""
@@ -336,9 +341,9 @@ class IdealisedNetwork:
             net.outputs[:] = self.before
             return
         self.bias += total
-        reached = np.diag(net.last) + 2 * (left * right).sum(axis=0)
-        square = np.minimum(np.maximum(reached, self.has_bias), self.largest).astype(np.float32)
-        shrunk = np.sqrt(np.divide(square, reached, out=np.ones_like(square), where=reached > square))
+        lengths = np.diag(net.last) + 2 * (left * right).sum(axis=0)
+        square = np.minimum(np.maximum(lengths, self.has_bias), self.largest).astype(np.float32)
+        shrunk = np.sqrt(np.divide(square, lengths, out=np.ones_like(square), where=lengths > square))
         move_kernel(net.last, left, right, shrunk, np.sqrt(square), np.float32(self.has_bias))
         values, vectors = np.linalg.eigh((gram + gram.T) / 2)
         net.gram[:] = (vectors * np.maximum(values, 0.0)) @ vectors.T

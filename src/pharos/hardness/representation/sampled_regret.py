@@ -295,10 +295,12 @@ class SampledLearner(IdealisedLearner):
         """The schedule, JSON-able. Its optimizer does not count."""
         return {name: value for name, value in asdict(self.schedule).items() if name != "optimizer"}
 
-    def curve_of_walks(self, observations: Grouped, operator: KernelOperator) -> SampledCurve:
-        """The regret of all walks, with a kernel over the observations."""
+    def curve_of_walks(
+        self, observations: Grouped, operator: KernelOperator, seeds: range | None = None
+    ) -> SampledCurve:
+        """The regret of walks of some seeds, or of all, with a kernel over the observations."""
         steps = self.steps()
-        walks = (self.walk(observations, operator, steps, seed) for seed in self.seeds)
+        walks = (self.walk(observations, operator, steps, seed) for seed in seeds or self.seeds)
         regrets = np.array([[self._regret_of(q, observations) for q in walk] for walk in walks])
         return SampledCurve(steps, regrets, self.worst)
 
