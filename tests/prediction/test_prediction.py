@@ -322,9 +322,7 @@ def test_nothing_is_called_without_pairs():
 def test_the_order_of_networks_is_not_called():
     answer = pharos.predict("simple_grid", networks=["mlp8x2", "mlp128x2"], steps=6000, height=3, width=3)
     (order,) = answer.orders
-    assert (
-        order.of_networks and not order.is_called and "predictions ordered networks rightly in 5 of 16" in str(order)
-    )
+    assert order.of_networks and not order.is_called and "predictions ordered networks rightly in 5 of 16" in str(order)
     texts = [(CHOICES / f"{name}.csv").read_text().splitlines() for name in ("predictions-network", "runs")]
     cells = [{tuple(r.values())[:6]: r for r in csv.DictReader(lines) if r["kind"] == "network"} for lines in texts]
     right = []
