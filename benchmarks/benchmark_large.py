@@ -24,7 +24,10 @@ from pharos.benchmark.suite import FOLDER, digest_of_suite
 from pharos.environments import make
 from pharos.training import Task
 
-RUNS = Path(__file__).parent.parent / "docs/studies/paper/runs.parquet"
+STUDY = Path(__file__).parent.parent / "docs/studies/paper"
+RUNS = STUDY / "runs.parquet"
+LATER = STUDY / "later-runs.parquet"
+"""Runs made after the suite was frozen: they are of baselines alone, and its tasks' seconds know nothing of them."""
 PROTOCOL = Protocol(steps=600_000, evaluations=20, seeds=5)
 OBSERVATIONS = "vector", "simple_image"
 CHANCES: tuple[dict[str, float], ...] = ({}, {"random": 0.1})
@@ -41,8 +44,8 @@ Runs = Mapping[tuple[str, str, float, str], list[tuple[dict[str, Any], np.ndarra
 """(instance, observation, probability of random actions, agent) -> records and curves, by seed."""
 
 
-def stored_runs() -> Runs:
-    """The runs of the grid on large instances, without chance and with random actions."""
+def stored_runs(*files: Path) -> Runs:
+    """Packed runs of the grid on large instances, without chance and with random actions."""
     import pandas as pd
 
     names = {}
@@ -50,7 +53,7 @@ def stored_runs() -> Runs:
         env = make(name)
         names[env.name, json.dumps(json.loads(json.dumps(env.parameters)), sort_keys=True)] = name
     runs = defaultdict(list)
-    frame = pd.read_parquet(RUNS)
+    frame = pd.concat([pd.read_parquet(file) for file in files])
     for text, steps, regrets in zip(frame["record"], frame["step"], frame["normalized_regret"], strict=True):
         record = json.loads(text)
         config = record["config"]
@@ -180,7 +183,7 @@ def main() -> None:
     if options.check is not None:
         check(load_suite("large"), options.check)
         return
-    runs = stored_runs()
+    runs = stored_runs(RUNS)
     (dqn, _), *_ = runs["freeway/20x5-speed1", "simple_image", 0.0, "dqn"]
     (ppo, _), *_ = runs["freeway/20x5-speed1", "vector", 0.0, "ppo"]
     (table, _), *_ = runs["freeway/20x5-speed1", "index", 0.0, "q_learning"]
@@ -197,6 +200,7 @@ def main() -> None:
     )
     suite = replace(suite, digest=digest_of_suite(suite))
     write_suite(suite, FOLDER / "large.yaml")
+    runs = stored_runs(RUNS, LATER)
     for agent in settings:
         results = baseline(runs, suite, agent)
         file = BASELINES / suite.name / f"{agent}.safetensors"

@@ -525,6 +525,16 @@ def units(frame):
         print(f"| {words} | {' | '.join(texts)} |")
 
 
+def misses_of_second(frame):
+    """Mean of observed less predicted regret of a DQN in classes of the second sealed set that any predictor missed."""
+    told = pd.read_csv(STUDIES / "sealed-2" / "cells.csv")[[*CELL, "sampled_regret"]]
+    cells = frame[(frame["study"] == "sealed-2") & (frame["agent"] == "dqn")].merge(told, on=CELL)
+    columns = "predicted", "before", "sampled_regret"
+    misses = cells[[*columns]].rsub(cells["observed"], axis=0).groupby(cells["environment"]).mean()
+    for name, row in misses[misses.abs().max(axis=1) > 0.1].iterrows():
+        print(f"| {name} | {' | '.join(f'{row[column]:+.2f}' for column in columns)} |")
+
+
 def row_of(part, blocks, name, width, resamples):
     """A row of the table of a sealed test: of cells and a predictor, with the share that lies within `width`."""
     cells = part.rename(columns={name: "predicted", "greedy": "observed", "num_states": "states"})
@@ -746,6 +756,7 @@ def main():
         draw(other_cells(), STUDIES.parent / "images" / "other-classes.png")
     elif arguments.task == "units":
         units(pd.read_csv(arguments.cells))
+        misses_of_second(pd.read_csv(arguments.cells))
     elif arguments.task == "walks":
         walks(arguments.cells, arguments.block or [*BLOCKS], arguments.resamples)
     elif arguments.task == "ablations":
