@@ -87,7 +87,7 @@ def runs(name):
     """The runs of a study: `classes` consists of two packed files, `paper` is the paper's grid as far as it was run."""
     files = {
         "classes": ("small/runs.parquet", "classes/large.parquet"),
-        "paper": ("paper/runs.parquet",),
+        "paper": ("paper/runs.parquet", "paper/later-runs.parquet"),
         "one_hot": ("one_hot/runs.parquet", "small/runs.parquet"),
     }
     return pd.concat([packed(file)[0] for file in files[name]], ignore_index=True)

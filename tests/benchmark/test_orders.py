@@ -29,7 +29,7 @@ def test_scores_are_means_over_the_tasks_that_all_agents_have_run(orders):
     """From the curves alone: 1 less the mean regret of each run, which is clipped as a whole."""
     curves = {name: read_results(f"large/{name}").curves for name in orders.AGENTS}
     common = set.intersection(*map(set, curves.values()))
-    assert len(common) == 60 == len(orders.shipped("large"))
+    assert len(common) == 80 == len(orders.shipped("large"))
     own = orders.mean_of(orders.shipped("large").values())
     for name, each in curves.items():
         scores = [1 - min(max(np.mean(run), 0.0), 1.0) for task in sorted(common) for run in each[task]]
