@@ -3,6 +3,7 @@
 python scripts/atari_page.py                 all games
 python scripts/atari_page.py pong freeway    these alone; the other rows stay as they are
 python scripts/atari_page.py --runs FOLDER   the table of runs beside their predictions, from finished runs in FOLDER
+python scripts/atari_page.py --predict       what `pharos predict` says of the same games now, beside their runs
 
 Needs ale-py for games. Pictures are screens of an optimal play; the tables stay in a temporary folder.
 """
@@ -75,8 +76,9 @@ def row(game: str) -> str:
 
 def main() -> None:
     if sys.argv[1:2] == ["--runs"]:
-        write_runs(Path(sys.argv[2]))
-        return
+        return write_runs(Path(sys.argv[2]))
+    if sys.argv[1:2] == ["--predict"]:
+        return predict_again()
     for name in sys.argv[1:] or GAMES:
         line = row(name)
         print(line, flush=True)
@@ -118,6 +120,24 @@ def write_runs(folder: Path) -> None:
     lines = [line_of(cell, rows) for cell in cells]
     after = re.sub(r"Of DQN's intervals .*?\n\n", lambda _: agreement(cells, rows) + "\n\n", after, flags=re.DOTALL)
     PAGE.write_text("\n".join([before + RUNS, "|---" * RUNS.count(" | ") + "|---|", *lines, "", after]))
+
+
+def predict_again() -> None:
+    """Print the lines of the table of runs by the predictors of today, and how far they agree."""
+    with (STUDY / "predictions.csv").open() as stream:
+        cells = list(csv.DictReader(stream))
+    with (STUDY / "runs.csv").open() as stream:
+        rows = [list(row.values()) for row in csv.DictReader(stream)]
+    for game in dict.fromkeys(cell["game"] for cell in cells):
+        horizon, options = GAMES[game]
+        with tempfile.TemporaryDirectory() as place:
+            importers.save_recording(*table_and_screens(game, horizon, options), place)
+            env = pharos.make("imported", folder=place)
+            for cell in (cell for cell in cells if cell["game"] == game):
+                answer = pharos.predict(env, ("recorded", {"grey": True, "size": 84}), agent=cell["agent"]).cells[0]
+                cell |= {"predicted_regret": str(answer.value), "low": str(answer.low), "high": str(answer.high)}
+                print(line_of(cell, rows), flush=True)
+    print(agreement(cells, rows))
 
 
 def agreement(cells: list[dict[str, str]], rows: list[list]) -> str:
