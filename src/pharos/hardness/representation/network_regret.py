@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from pharos.kernels.actor_critic import Rollout
 
 NETWORK_WALKS = 8
-"""Walks of which the mean is taken: more predict the published cells little better (docs/evidence/network-regret.md)."""
+"""Walks of which the mean is taken. More help little (docs/evidence/network-regret.md)."""
 TABLE_WALKS = 3
 """Those of them that are walked with a table in the place of the network, too."""
 MOST_OBSERVATIONS = 4096
