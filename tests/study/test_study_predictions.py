@@ -69,8 +69,8 @@ def test_the_primary_predictor_alone_is_what_it_is_beside_the_others(predicted, 
         assert alone.loc[rows, names].notna().all().all()
     assert alone[[*PREDICTORS[:-1], "policy_regret", "huber_regret", "clipped_regret_evaluated"]].isna().all().all()
     assert alone["estimated_error"].tolist() == [0.0] * 4  # small kernels are exact
-    assert alone["notes"].str.contains("^network_regret: a mean over 3 walks").tolist() == [True, True, False, False]
-    assert alone["notes"].str.contains("^network_policy_regret: a mean over 3").tolist() == [False, False, True, True]
+    assert alone["notes"].str.contains("^network_regret: a mean over 8 walks").tolist() == [True, True, False, False]
+    assert alone["notes"].str.contains("^network_policy_regret: a mean over 8").tolist() == [False, False, True, True]
 
 
 def test_the_primary_predictor_of_an_agent_that_has_none_is_a_note(tmp_path):
