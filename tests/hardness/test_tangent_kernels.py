@@ -292,7 +292,7 @@ def test_errors_of_an_output_layer_name_the_network():
 
 
 def test_regret_in_a_network_of_a_function_is_near_the_regret_of_its_name(grid):
-    """Means over 3 walks, one of which deviates by about 0.25 (DQN) and 0.01 (PPO)."""
+    """Means over 8 walks, one of which deviates by about 0.25 (DQN) and 0.01 (PPO)."""
     seen = [representation(grid, "vector", network) for network in (layers_of_64, "mlp64x2")]
     for measure, tolerance in ((network_regret, 0.4), (network_policy_regret, 0.05)):
         own, named = (measure(grid.mdp(), each, schedule=Schedule(steps=4000)) for each in seen)
