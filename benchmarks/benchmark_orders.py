@@ -47,9 +47,13 @@ def main() -> None:
         print_larger(options.larger, options.workers)
 
 
-def shipped(suite: str) -> dict[str, dict[str, float]]:
-    """Task -> mean score of each agent's shipped baseline, of the tasks that all agents have run, in their order."""
-    runs = {name: run_scores(benchmark.read_results(f"{suite}/{name}")) for name in AGENTS}
+def shipped(suite: str, *, last: bool = False) -> dict[str, dict[str, float]]:
+    """Task -> mean score of each agent's shipped baseline, of the tasks that all agents have run, in their order.
+
+    Args:
+        last: of the last evaluation alone, in place of the mean over the run.
+    """
+    runs = {name: run_scores(benchmark.read_results(f"{suite}/{name}"), last=last) for name in AGENTS}
     return {
         task.name: {name: float(own[task.name].mean()) for name, own in runs.items()}
         for task in benchmark.load_suite(suite).tasks
@@ -100,7 +104,8 @@ def header(titles: Sequence[str]) -> str:
 
 
 def print_orders() -> None:
-    """Two tables: order by suite and by part of it, and on how many tasks each agent is better than each other one."""
+    """Three tables: order by suite and by part of it, on how many tasks each agent is better than each other one, and
+    order by the last evaluations alone."""
     tables = {suite: shipped(suite) for suite in SUITES}
     core = groups(benchmark.load_suite(SUITES[0]))[benchmark.suite.CORE]
     first = mean_of(tables[SUITES[0]][name] for name in core)
@@ -114,6 +119,10 @@ def print_orders() -> None:
     for one, other in combinations(AGENTS, 2):
         cells = [better(scores.values(), one, other) for scores in tables.values()]
         print(f"| {AGENTS[one]} or {AGENTS[other]} | {' | '.join(cells)} |")
+    print("\n" + header(["last evaluation of", "tasks", *AGENTS.values(), "order"]))
+    for title, names in (("v1, core", core), ("large, all", list(tables["large"]))):
+        ends = shipped(title.partition(",")[0], last=True)
+        print(row(title, len(names), mean_of(ends[name] for name in names)))
 
 
 def better(scores: Iterable[Scores], one: str, other: str) -> str:

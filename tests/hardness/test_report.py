@@ -113,6 +113,16 @@ def test_results_are_kept_beside_the_space_with_what_they_depend_on():
     assert not hardness.report(mdp, "diameter", keep=False)["diameter"].kept
 
 
+@pytest.mark.parametrize(
+    "learner", [{"sampling": hardness.Sampling(seed=7)}, {"rollouts": hardness.Rollouts()}, {"adam": hardness.Adam()}]
+)
+def test_what_is_measured_of_the_world_alone_is_kept_whatever_learns(learner):
+    mdp, name = grid().with_horizon(20), "stationary_effective_horizon"
+    hardness.report(mdp, name)
+    seen = hardness.Representation.of_matrix(np.eye(mdp.num_states))
+    assert hardness.report(mdp, name, representation=seen, **learner)[name].kept
+
+
 def test_an_interval_is_computed_anew_with_a_larger_budget():
     mdp, squeezed = grid(), lambda problem: hardness.Interval(0.0, 100 / problem.budget.seconds, exact=False)
     hardness.register("squeezed", squeezed, definition="", version=1)

@@ -268,7 +268,7 @@ REPORT_FILE = "hardness.json"
 REPORT_FORMAT = 2
 
 # Conventions that the results of a measure depend on, by its `depends`; else all, but for these if it is "all".
-_OF_REPRESENTATIONS = ("representation", "schedule", "rollouts", "adam")
+_OF_REPRESENTATIONS = ("representation", "schedule", "rollouts", "sampling", "adam")
 _DEPENDS = {
     "structure": ("chance", "restart"),
     "values": ("chance", "gamma", "horizon_of_values", "tolerance"),

@@ -48,8 +48,8 @@ class Sampling:
         batch_size: transitions of a gradient step.
         buffer_size: transitions that are remembered.
         reward_noise: standard deviation of normal noise on what is paid. The regret is of what is earned.
-        reward_scale: what is earned is divided by it before it is paid. Without noise, `huber_regret` alone depends
-            on it.
+        reward_scale: what is earned is divided by it before it is paid. Without noise `sampled_regret` does not
+            depend on it.
         seed: of the first walk. The others have the next ones.
     """
 
