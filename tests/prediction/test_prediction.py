@@ -144,6 +144,14 @@ def test_the_published_hyperparameters_are_a_choice_and_others_are_named(tmp_pat
     assert "mine.yaml" in (other := run(*words, "mine.yaml").output) and "common" in other
 
 
+def test_what_nobody_declares_is_not_named_as_another_hyperparameter():
+    declared = {name: value for name, value in COMMON["dqn"].items() if name not in ("n_envs", "n_steps")}
+    for changed, named in (({}, ""), ({"n_steps": 3}, "n_steps: "), ({"gamma": 0.9}, "gamma: ")):
+        said = pharos.predict("river_swim", length=5, steps=1500, agent="dqn", hyperparameters={**declared, **changed})
+        lines = [line for line in said.warnings if "--hyperparameters" in line]
+        assert len(lines) == bool(named) and all(line.startswith(named) for line in lines)
+
+
 def test_a_unit_outside_of_what_was_tested_is_named():
     known = published("dqn")
     low, high = known.spreads.min(), known.spreads.max()

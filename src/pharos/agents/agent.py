@@ -192,7 +192,7 @@ class Agent:
             of environments declares what suits it better.
         space: that `tune` searches: of each hyperparameter ("log", low, high), ("linear", low, high), or ("one of",
             value, ...).
-        benchmark_defaults: what only some classes of environments declare. The benchmark has one setting for all tasks.
+        benchmark_defaults: values of those that only some classes declare. The benchmark has one setting for all tasks.
         idealised: the learner that `predict` computes in its place.
         relatives: words in names of algorithms that are of its kind.
         fixed_observation: what it always sees. None: what is asked for.

@@ -408,8 +408,9 @@ def _stand_ins(agent: str, cells: Iterable[PredictedRegret]) -> Iterable[str]:
 
 
 def _other_hyperparameters(agent: str, settings: Mapping[str, Any]) -> Iterable[str]:
-    """A line if hyperparameters differ from the published cells."""
-    other = [name for name, value in COMMON[agent].items() if settings.get(name) != value]
+    """A line if hyperparameters differ from the published cells. What a class does not declare is the agent's."""
+    own = {**agent_called(agent).benchmark_defaults, **settings}
+    other = [name for name, value in COMMON[agent].items() if own.get(name) != value]
     if other:
         yield (
             f"{', '.join(other)}: not as in the published cells, for which the interval is calibrated; "
