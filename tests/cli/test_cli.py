@@ -515,7 +515,23 @@ def test_what_ends_a_build_is_one_line_with_its_exit_code(failure, monkeypatch, 
 def test_a_full_or_forbidden_disk_is_one_line(failure, monkeypatch):
     error = PermissionError(13, "Permission denied", "/somewhere")
     monkeypatch.setattr("pharos.state_space.build", failing(error))
-    assert failure("build", "simple_grid") == (1, "pharos: /somewhere: Permission denied\n")
+    assert failure("build", "simple_grid") == (1, "pharos: /somewhere: Permission denied; choose another place\n")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("train", "river_swim", "--agent", "q_learning", "--steps", "500"),
+        ("benchmark", "run", "--agent", "q_learning", "--quick"),
+        ("study", "run", "quick"),
+    ],
+)
+def test_a_file_in_the_place_of_a_folder_says_what_to_try(failure, tmp_path, command):
+    path = tmp_path / "taken"
+    path.write_text("mine", encoding="utf-8")
+    code, line = failure(*command, "--out", path)
+    assert code == 1 and line == f"pharos: {path}: File exists; expected a folder; choose another name\n"
+    assert path.read_text(encoding="utf-8") == "mine"
 
 
 # As a process --------------------------------------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """The application: its commands, and the conversion of errors to one line and an exit code."""
 
+import errno
 import os
 import sys
 import warnings
@@ -46,6 +47,15 @@ REMOVED = {
     "pharos solve --jacobi": "--jacobi is gone: values of any --processes are within --tolerance, which may be lower",
 }
 # What NumPy says of an array that no machine can hold, by a ValueError
+ADVICE = {
+    errno.EEXIST: "expected a folder; choose another name",
+    errno.ENOTDIR: "a part of the path is a file; choose another place",
+    errno.EISDIR: "expected a file; choose another name",
+    errno.EACCES: "choose another place",
+    errno.EROFS: "choose another place",
+    errno.ENOSPC: "free some, or choose another disk",
+}
+"""What to try, by the number of an error of the operating system."""
 NO_ARRAY = ("array is too big", "Maximum allowed dimension exceeded")
 
 
@@ -121,7 +131,8 @@ def _exit_code(error: Exception) -> int | None:
         return EXIT_FAILED
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename is not None else ""
-        complain(f"{where}{error.strerror or error}")
+        advice = f"; {ADVICE[error.errno]}" if error.errno in ADVICE else ""
+        complain(f"{where}{error.strerror or error}{advice}")
         return EXIT_FAILED
     if isinstance(error, MemoryError):
         complain(f"out of memory: {error or 'an array did not fit'}; choose a smaller instance, or set --memory")
