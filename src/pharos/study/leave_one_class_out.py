@@ -184,9 +184,13 @@ def unseen_classes(
         predictors = () if predictions is None else _predictors_of(predictions)
     if not len(both):
         raise ParameterError("no cell of the predictions has finished runs; are they of this study?")
-    if both["environment"].nunique() < least_classes:
+    names = sorted(both["environment"].unique())
+    if len(names) < least_classes:
         words = {2: "two", 3: "three"}.get(least_classes, str(least_classes))
-        raise ParameterError(f"predictions on unseen classes need at least {words} classes with finished runs")
+        raise ParameterError(
+            f"predictions on unseen classes need at least {words} classes with finished runs; found "
+            f"{', '.join(names)}: run more, or report without predictions"
+        )
     tabular: list[str] = []
     if measures is not None:
         table = measures.drop(columns=["notes"], errors="ignore").rename(columns={"num_states": "states"})
