@@ -181,6 +181,18 @@ def test_keywords_of_a_function_are_its_hyperparameters(mine):
         train("bare.py:learn", GRID, hyperparameters={"rate": 1}, **options)
 
 
+def test_an_argument_with_a_default_is_a_hyperparameter_and_no_key_of_jax(mine):
+    text = Path("mine.py").read_text()
+    assert "seed, *, rate" in text
+    Path("plain.py").write_text(text.replace("seed, *, rate", "seed, rate"))
+    options = {"observation": "one_hot", "steps": 200, "evaluation_interval": 50}
+    for given in ({}, {"rate": -0.5}):
+        behind, plain = (train(name, GRID, hyperparameters=given, **options) for name in (mine, "plain.py:learn"))
+        assert str(behind.curve) == str(plain.curve)
+    with pytest.raises(UnknownName, match=r"unknown hyperparameter of plain.py:learn 'seed'"):
+        train("plain.py:learn", GRID, hyperparameters={"seed": 1}, **options)
+
+
 def test_what_is_no_agent_is_refused_in_one_line(mine):
     Path("bad.py").write_text("number = 3\ndef two(env, steps): pass\ndef none(env, steps, seed): return 5\n")
     for name, said in (

@@ -128,12 +128,12 @@ def form_of(name: str, code: object) -> str:
         raise ParameterError(
             f"agent {name!r} is {code!r}; expected a class for Stable-Baselines3, or a function learn(env, steps, seed)"
         )
-    with contextlib.suppress(TypeError, ValueError):
-        inspect.signature(code).bind(None, None, 0, None)
-        return COMPILED
     try:
         inspect.signature(code).bind(None, 0, 0)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError) as error:  # of both together: learn(env, steps, seed, rate=0.1) is a generator, too
+        with contextlib.suppress(TypeError, ValueError):
+            inspect.signature(code).bind(None, None, 0, None)
+            return COMPILED
         raise ParameterError(f"agent {name!r}: {error}; expected {FUNCTIONS}") from None
     return GENERATOR
 
@@ -250,14 +250,19 @@ class OwnAgent(DeepAgent):
 
 
 def check_keywords(name: str, code: Any, hyperparameters: Mapping[str, Any]) -> None:
-    """Raise UnknownName or ParameterError for hyperparameters that are no keywords of the function."""
+    """Raise UnknownName or ParameterError for hyperparameters that are no keywords of the function.
+
+    Keywords are what is behind a *, or has a default and comes after the arguments that every agent gets.
+    """
     parameters = inspect.signature(code).parameters.values()
     if any(each.kind is each.VAR_KEYWORD for each in parameters):
         return
-    is_class = isinstance(code, type)
-    keywords = [
-        each.name for each in parameters if each.kind is each.KEYWORD_ONLY or (is_class and each.name not in MADE_WITH)
-    ]
+    if isinstance(code, type):
+        keywords = [each.name for each in parameters if each.name not in MADE_WITH]
+    else:
+        further = [each for each in parameters if each.kind is each.POSITIONAL_OR_KEYWORD]
+        further = further[3 if form_of(name, code) == GENERATOR else 4 :]
+        keywords = [each.name for each in parameters if each.kind is each.KEYWORD_ONLY or each in further]
     unknown = [each for each in hyperparameters if each not in keywords]
     if unknown and not keywords:
         raise ParameterError(
