@@ -216,6 +216,21 @@ def test_training_says_what_to_do_about_masks_and_wrappers_of_rl_zoo(agent, hype
     assert re.search(text, said)
 
 
+class HalfAModel:
+    """What looks like a model of Stable-Baselines3, but is none."""
+
+    def __init__(self, policy, env, **options):
+        self.policy = policy
+
+    def learn(self, total_timesteps, callback=None):
+        return self
+
+
+def test_a_class_that_lacks_parts_of_the_interface_is_refused_by_their_names():
+    said = refusal(ParameterError, pharos.train, HalfAModel, LAKE, steps=64)
+    assert "has no num_timesteps, set_logger, get_parameters, set_parameters; expected a class derived from" in said
+
+
 # Numbers of states ---------------------------------------------------------------------------------------------------
 
 

@@ -56,6 +56,8 @@ POSITIVE = ("learning_rate", "clip_range", "max_grad_norm")
 NOT_NEGATIVE = ("learning_starts", "ent_coef", "vf_coef")
 # What `make_model` gives itself.
 RESERVED_ARGUMENTS = {"env", "seed", "device", "tensorboard_log", "_init_setup_model"}
+# What is asked of a model.
+INTERFACE = ("learn", "policy", "num_timesteps", "set_logger", "get_parameters", "set_parameters")
 NO_NORMALIZER = (
     "leave it out, as `vector` is in [0, 1] and rewards are small; or train behind VecNormalize yourself, and evaluate "
     "with pharos.evaluate_policy, which applies it"
@@ -248,6 +250,11 @@ def make_model(
         if "allocate" not in str(error):
             raise
         raise MemoryError(f"the network of {_title(agent)!r}: net_arch is {network['net_arch']}") from error
+    if missing := [name for name in INTERFACE if not hasattr(model, name)]:
+        raise ParameterError(
+            f"agent {_title(agent)!r} has no {', '.join(missing)}; expected a class derived from Stable-Baselines3's "
+            "BaseAlgorithm, or one with act, observe and policy"
+        )
     if tensorboard is None:  # the logger that it would make itself leaves a folder among the temporary files
         from stable_baselines3.common.logger import HumanOutputFormat, KVWriter, Logger
 
