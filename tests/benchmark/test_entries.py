@@ -80,6 +80,12 @@ def test_what_a_table_claims_is_computed_again(run, file):
     assert [check.name for check in verdict.checks] == ["value", "regret", "value_optimal", "value_uniform"]
 
 
+def test_a_run_whose_rewards_are_divided_by_their_range_is_computed_again(tmp_path):
+    options = {"steps": 500, "scale_rewards": "range", "reward_noise": 0.5}
+    pharos.train("q_learning", "simple_grid", height=3, width=3, out=tmp_path / "run", **options)
+    assert benchmark.verify(benchmark.submit(tmp_path / "run", tmp_path / "e.safetensors")).holds
+
+
 def test_the_same_run_gives_the_same_bytes(run, tmp_path):
     one, two = (benchmark.submit(run, tmp_path / f"{k}.safetensors", note="x") for k in range(2))
     assert one.read_bytes() == two.read_bytes()

@@ -178,6 +178,10 @@ def test_what_is_no_agent_is_refused_in_one_line():
         learner_of("q_learning")
     with pytest.raises(ParameterError, match="JAX"):
         learner_of(lambda env, params, steps, key: None)
+    with pytest.raises(ParameterError, match="found rate; name them behind"):
+        learner_of(lambda env, steps, seed: None, {"rate": 1})
+    with pytest.raises(UnknownName, match="did you mean 'learning_rate'"):
+        learner_of("dqn", {"learning_rat": 1})
     assert len(NAMES) == 12
 
 

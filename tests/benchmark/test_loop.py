@@ -12,8 +12,8 @@ from command_line import answer, run
 from pharos import benchmark
 from pharos.benchmark import BenchmarkTask, BudgetSpent, Protocol, Suite, write_suite
 from pharos.benchmark.suite import digest_of_suite, frozen
-from pharos.errors import ParameterError, UnknownName
-from pharos.training import RegretCurve, evaluate_agent, read_record, read_rows
+from pharos.errors import FileFormatError, ParameterError, UnknownName
+from pharos.training import RegretCurve, evaluate_agent, load_agent, read_record, read_rows
 
 PROTOCOL = Protocol(steps=300, evaluations=3, seeds=2)
 TASKS = (
@@ -54,6 +54,30 @@ def play(env, steps, action=0):
 
 def always(action):
     return lambda observations: np.full(len(observations), action)
+
+
+def test_a_table_of_a_loop_is_evaluated_from_its_folder_and_steps_are_numbers_of_steps(tmp_path):
+    options = {"steps": 100, "height": 3, "width": 3}
+    with pharos.Run("simple_grid", out=tmp_path / "table", **options) as loop:
+        for step, policy, said in ((-1, 0, "step is -1"), (1.5, 0, "step is 1.5"), (10, None, "policy is None")):
+            with pytest.raises(ParameterError, match=said):
+                loop.evaluate(step, policy)
+        value = loop.evaluate(100.0, np.ones(9, int))["value"]
+    task, table = load_agent(tmp_path / "table")
+    assert evaluate_agent(table, task).value == value
+    with pharos.Run("simple_grid", out=tmp_path / "function", **options) as loop:
+        loop.evaluate(100, always(0))
+    with pytest.raises(FileFormatError, match="keeps its policy if that is a table"):
+        load_agent(tmp_path / "function")
+
+
+def test_results_of_a_suite_in_a_file_say_that_it_is_to_be_named(tmp_path, suite):
+    write_suite(suite, tmp_path / "small.yaml")
+    options = ("--agent", "q_learning", "--seeds", "0:2", "--out", tmp_path / "r")
+    assert run("benchmark", "run", "--suite", tmp_path / "small.yaml", *options).exit_code == 0
+    words = ("benchmark", "report", tmp_path / "r", "--out", tmp_path / "r.html")
+    assert "suite 'small', which is not shipped; give its file: --suite" in run(*words).output
+    assert run(*words, "--suite", tmp_path / "small.yaml").exit_code == 0 and (tmp_path / "r.html").stat().st_size
 
 
 # Tasks ----------------------------------------------------------------------------------------------------------------

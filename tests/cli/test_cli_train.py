@@ -38,6 +38,21 @@ def test_wrong_words_are_usage_errors(tmp_path):
         assert run("simple_grid", *words).exit_code == 2
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--no-horizon", "--horizon", 5), "--no-horizon and --horizon 5 contradict each other"),
+        (("--device", "cuda"), "--device cuda goes with --seeds"),
+        (("--set", "initial_q=abc"), "initial_q is 'abc'; expected a finite number"),
+        (("--set", "sees_previous_action=no"), "sees_previous_action is 'no'; expected true or false"),
+        (("--set", "sees_previous_action=true"), "is for sticky actions, and there are none"),
+    ],
+)
+def test_what_would_be_left_out_is_refused(words, said):
+    done = run("simple_grid", "--steps", 100, *words)
+    assert done.exit_code == 2 and said in done.output
+
+
 def test_many_seeds_leave_a_folder_each_and_one_table(tmp_path):
     words = ("simple_grid/4x4-plain", "--steps", 2000, "--interval", 1000, "--out", tmp_path)
     done = run(*words, "--seeds", "0:2,7", "--engine", "batched")

@@ -62,6 +62,18 @@ def test_runs_that_differ_in_more_than_the_seed_are_told_apart(folders):
     assert any("random=0.1" in label for label in lines(left))
 
 
+def test_curves_with_rewards_in_another_unit_are_named_and_without_a_common_step_refused(tmp_path, folders):
+    options = {"steps": 2000, "evaluation_interval": 200, "scale_rewards": "range"}
+    train("q_learning", "frozen_lake/4x4", out=tmp_path / "unit", **options)
+    left, _ = plots.regret([folders[0], tmp_path / "unit"]).axes
+    assert any("scale_rewards=range" in line.get_label() for line in left.lines)
+    for name, step in (("a", 100), ("b", 99)):
+        with pharos.Run("frozen_lake/4x4", steps=300, seed=step, out=tmp_path / name) as run:
+            run.evaluate(step, np.zeros(16, int))
+    said = refusal(ParameterError, plots.regret, [tmp_path / "a", tmp_path / "b"])
+    assert "no evaluated step in common" in said
+
+
 def test_regret_needs_runs(tmp_path):
     assert "at least one folder" in refusal(ParameterError, plots.regret, [])
     assert "expected the folder of a run" in refusal(FileFormatError, plots.regret, [tmp_path])

@@ -163,6 +163,34 @@ def test_the_command_answers_in_json_and_train_takes_its_file(tmp_path):
     assert used == {**answer["hyperparameters"], "gamma": 0.9}
 
 
+@pytest.mark.parametrize(
+    ("table", "expected"),
+    [
+        ("q_learning: {default: {learning_rate: 0.3}}", {"learning_rate": 0.3}),
+        (
+            "q_learning: {default: {default: {learning_rate: 0.3}, index: {gamma: 0.9}}}",
+            {"learning_rate": 0.3, "gamma": 0.9},
+        ),
+        (
+            "q_learning: {default: {gamma: 0.8}, frozen_lake: {index: {gamma: 0.9}, other: {gamma: 0.7}}}",
+            {"gamma": 0.9},
+        ),
+        ("dqn: {default: {policy_kwargs: {net_arch: [8]}}}", {"policy_kwargs": {"net_arch": [8]}}),
+        ("q_lerning: {default: {gamma: 0.9}}", None),
+        ("q_learning: {frozen_lakee: {default: {gamma: 0.9}}}", None),
+    ],
+)
+def test_a_table_is_by_agent_class_and_observation_or_refused(tmp_path, table, expected):
+    file = tmp_path / "t.yaml"
+    file.write_text(table, encoding="utf-8")
+    agent = table.partition(":")[0].replace("lern", "learn")
+    if expected is None:
+        with pytest.raises(ParameterError, match="says nothing of q_learning in frozen_lake"):
+            hyperparameters(agent, "frozen_lake", "index", table=file)
+    else:
+        assert hyperparameters(agent, "frozen_lake", "index", table=file) == expected
+
+
 def test_the_command_prints_a_table_and_refuses_wrong_words():
     options = ("--agent", "q_learning", "--steps", 500)
     assert "mean normalised regret" in run("tune", LAKE, *options, "--trials", 1).stdout

@@ -15,6 +15,7 @@ from pharos.agents.agent import (
     is_known,
     joined_states,
     learner_state,
+    read_policy_table,
 )
 from pharos.agents.idealised import (
     HUBER_PREDICTORS,

@@ -182,8 +182,12 @@ def checked_options(changes: Mapping[str, Any]) -> dict[str, Any]:
         options["exploration_initial_eps"] > 0 and options["exploration_final_eps"] > 0
     ):
         raise ParameterError("q_learning: an exponential schedule needs both epsilons above 0")
-    if not math.isfinite(options["initial_q"]):
-        raise ParameterError(f"q_learning: initial_q is {options['initial_q']!r}; expected a finite number")
+    if not isinstance(options["sees_previous_action"], bool):
+        wrong = options["sees_previous_action"]
+        raise ParameterError(f"q_learning: sees_previous_action is {wrong!r}; expected true or false")
+    initial = options["initial_q"]
+    if isinstance(initial, bool) or not isinstance(initial, int | float) or not math.isfinite(initial):
+        raise ParameterError(f"q_learning: initial_q is {initial!r}; expected a finite number")
     return options
 
 
@@ -199,8 +203,12 @@ class QLearningAgent(TableBasedAgent):
     def table(self, run: LearningRun) -> QLearning:
         task, chance = run.task, run.task.scaled_chance
         # In another unit of rewards a table learns the same policies, from values and with noise in that unit
-        scale = chance.reward_scale
-        initial = {"initial_q": scale * float(run.hyperparameters.get("initial_q", Q_LEARNING_DEFAULTS["initial_q"]))}
+        scale, options = chance.reward_scale, checked_options(run.hyperparameters)
+        if options["sees_previous_action"] and not chance.sticky:
+            raise ParameterError(
+                "q_learning: sees_previous_action is for sticky actions, and there are none; leave it out, or add them"
+            )
+        initial = {"initial_q": scale * options["initial_q"]}
         return QLearning(
             task.mdp,
             total_steps=run.config.steps,

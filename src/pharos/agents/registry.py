@@ -70,9 +70,11 @@ def hyperparameters(
     Args:
         given: go before all others.
         table: a YAML that says all of it (agent, then "default" or the class, then "default" or the observation), such
-            as one that `pharos tune` wrote. None for what pharos and the class declare.
+            as one that `pharos tune` wrote. None for what pharos and the class declare. Values may stand directly under
+            the first "default".
     Raises:
-        ParameterError: the table has another form. MissingExtra: a table is given, and PyYAML is not installed.
+        ParameterError: the table has another form, or nothing for the agent in the class. MissingExtra: a table is
+            given, and PyYAML is not installed.
     """
     by_observation: Mapping[str, Any]
     if table is None:
@@ -80,12 +82,26 @@ def hyperparameters(
         default: Mapping[str, Any] | None = agent_called(agent).defaults
         by_observation = declaring.hyperparameters.get(agent, {}) if declaring else {}
     else:
-        entries = _read(table).get(agent) or {}
+        agents_of_table = _read(table)
+        entries = agents_of_table.get(agent) or {}
+        if not {"default", environment} & set(entries):
+            found = ", ".join(entries) or f"only {', '.join(agents_of_table) or 'nothing'}"
+            raise ParameterError(
+                f"{table} says nothing of {agent} in {environment}; found {found}; expected {agent}, then "
+                f"{environment} or default"
+            )
         default, by_observation = entries.get("default"), entries.get(environment) or {}
     result: dict[str, Any] = {}
-    for part in (default, by_observation.get("default"), by_observation.get(observation), given):
+    for part in (*_parts_of(default, observation), *_parts_of(by_observation, observation), given):
         result.update(part or {})
     return result
+
+
+def _parts_of(entry: Mapping[str, Any] | None, observation: str) -> Sequence[Mapping[str, Any] | None]:
+    """Hyperparameters of an entry by observation, the ones that go before others last. Of plain values the entry."""
+    if entry is None or any(name.endswith("kwargs") or not isinstance(entry[name], Mapping | None) for name in entry):
+        return (entry,)
+    return entry.get("default"), entry.get(observation)
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from pharos.benchmark.scores import (
     has_equal_seeds,
     run_scores,
 )
-from pharos.benchmark.suite import Suite, load_suite
+from pharos.benchmark.suite import Suite, load_suite, shipped_suites
 from pharos.errors import ParameterError
 from pharos.statistics import (
     CONFIDENCE,
@@ -330,4 +330,9 @@ def results_of(results: AgentResults | str | os.PathLike) -> AgentResults:
 
 def suite_of_results(results: AgentResults, suite: Suite | str | None) -> Suite:
     """The given suite, or the one that the results name."""
+    if suite is None and results.suite not in shipped_suites():
+        raise ParameterError(
+            f"results of {results.agent} are of the suite {results.suite!r}, which is not shipped; give its file: "
+            "--suite FILE.yaml (in Python: suite=)"
+        )
     return suite if isinstance(suite, Suite) else load_suite(suite or results.suite)

@@ -13,7 +13,18 @@ from typing import Any
 
 import numpy as np
 
-from pharos.agents import CLASS, QLearning, agents, algorithm, form_of, generator_of, is_known, make_model
+from pharos.agents import (
+    CLASS,
+    QLearning,
+    agents,
+    algorithm,
+    check_hyperparameters,
+    check_keywords,
+    form_of,
+    generator_of,
+    is_known,
+    make_model,
+)
 from pharos.benchmark.suite import BenchmarkTask, Protocol
 from pharos.errors import ParameterError, TimeLimit, UnknownName
 from pharos.policies import PolicyLike, SB3Model
@@ -319,7 +330,7 @@ def learner_of(agent: str | Callable[..., Any], hyperparameters: Mapping[str, An
         agent: a generator, or a class with act, observe and policy, or `file.py:Name` of one. Or the name or class of
             an algorithm of Stable-Baselines3, such as dqn.
     Raises:
-        ParameterError, UnknownName: there is no such agent, or it is one in JAX.
+        ParameterError, UnknownName: there is no such agent, it lacks a hyperparameter, or it is one in JAX.
     """
     setting = dict(hyperparameters or {})
     code: Any = agent
@@ -330,11 +341,13 @@ def learner_of(agent: str | Callable[..., Any], hyperparameters: Mapping[str, An
         if form not in (CLASS, "generator"):
             raise ParameterError(f"agent {agent!r} is in JAX; expected a generator: learn(env, steps, seed)")
         if form != CLASS:
+            check_keywords(str(agent), code, setting)
             return partial(generator_of(code), **setting)
     elif code in agents() and agents()[code].has_table:
         raise ParameterError(f"agent {code!r} is a table, which sees no observation; expected an agent with a network")
     defaults = dict(agents()[code].defaults) if isinstance(code, str) and code in agents() else {}
     algorithm(code)
+    check_hyperparameters(code, setting)
     return partial(_model_learner, code, {**defaults, **setting})
 
 

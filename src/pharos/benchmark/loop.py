@@ -20,6 +20,7 @@ from pharos.benchmark.execution import claimed, collected
 from pharos.benchmark.suite import BenchmarkTask, Suite, load_suite
 from pharos.environments import Environment, class_called
 from pharos.errors import AllRunsFailed, FolderLocked, ParameterError
+from pharos.mdp.arguments import whole_number
 from pharos.observations import own_observation
 from pharos.policies import PolicyLike
 from pharos.system import storage
@@ -256,15 +257,19 @@ class LoopRun:
             The row: `value`, `expected_regret`, `normalized_regret` (0 optimal, 1 as bad as random), `exact`, ...;
             episodes and returns are counted in `env`.
         Raises:
-            ParameterError: it is no policy, or not later than the row before.
+            ParameterError: it is no policy, or the step is no number of steps, or not later than the row before.
         """
+        number = int(step) if isinstance(step, float) and step.is_integer() else step
+        step = whole_number(number, "evaluate: step", "a whole number of steps so far", least=0)
+        if policy is None:
+            raise ParameterError("evaluate: policy is None; expected a table of states, a model, or a function")
         if self.rows and step <= self.rows[-1]["step"]:
             raise ParameterError(
                 f"evaluate: step {step:,} comes after step {self.rows[-1]['step']:,}; expected a later one: give the "
                 f"steps of the environment so far, each evaluation more"
             )
         budget = self.env.budget
-        row = self._curve.add(int(step), budget.episodes, budget.returns, policy)
+        row = self._curve.add(step, budget.episodes, budget.returns, policy)
         if self.folder is not None:
             self.folder.mkdir(parents=True, exist_ok=True)
             write_curve(self.folder, self.rows)

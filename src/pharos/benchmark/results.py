@@ -90,7 +90,7 @@ class AgentResults:
         elif not path.is_file():
             raise ParameterError(
                 f"{source}: no results; expected the folder of a run, its {RESULTS_FILE}, or a baseline: "
-                f"{', '.join(baselines(suite)) or 'none is shipped'}"
+                f"{', '.join(baselines(suite) or baselines())}"
             )
         return read_sealed(path, RESULTS_KIND, _results)
 

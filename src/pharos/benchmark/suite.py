@@ -256,6 +256,11 @@ class Suite:
             task.check(self.protocol)
 
 
+def shipped_suites() -> list[str]:
+    """Names of pharos' own suites."""
+    return sorted(each.stem for each in FOLDER.glob("*.yaml"))
+
+
 def load_suite(name_or_file: str | Path = "v1", *, trust: bool = False) -> Suite:
     """Read a suite: one of pharos' own by its name, or a file of the same form. Nothing that it names is imported.
 
@@ -271,9 +276,8 @@ def load_suite(name_or_file: str | Path = "v1", *, trust: bool = False) -> Suite
     path = Path(name_or_file)
     if path.suffix not in (".yaml", ".yml"):
         path = FOLDER / f"{name_or_file}.yaml"
-        names = sorted(each.stem for each in FOLDER.glob("*.yaml"))
-        if str(name_or_file) not in names:
-            raise UnknownName("suite", str(name_or_file), names)
+        if str(name_or_file) not in shipped_suites():
+            raise UnknownName("suite", str(name_or_file), shipped_suites())
     suite = suite_of(read_yaml(path, FileFormatError), str(path))
     for task in suite.tasks:
         named = [name for name in (task.environment, task.observation) if is_reference(name)]

@@ -185,6 +185,11 @@ def check(
     return Answer(vars(done), str(done), not done)
 
 
+SuiteOption = Annotated[
+    str | None, typer.Option(metavar="NAME|FILE.yaml", help="Suite of the results. Default: theirs.")
+]
+
+
 @app.command("report")
 def report(
     results: Annotated[str, "RESULTS"],
@@ -193,6 +198,7 @@ def report(
     beside: str | None = None,
     latex: bool = False,
     predictor: str | None = None,
+    suite: SuiteOption = None,
 ) -> Answer:
     """Write a page on an agent's results: frontiers in units, ladders, weaknesses, and residuals against theory.
 
@@ -206,7 +212,7 @@ def report(
     from pharos import benchmark
 
     others = None if beside is None else [each for each in beside.split(",") if each]
-    files = benchmark.report(results, out, beside=others, latex=latex, predictor=predictor)
+    files = benchmark.report(results, out, beside=others, latex=latex, predictor=predictor, suite=suite)
     return Answer({"files": files}, lambda: console().print(*map(str, files), sep="\n", markup=False))
 
 
@@ -426,11 +432,6 @@ def _print(suite: "Suite") -> None:
     title = f"{suite.name}, {pluralize(len(suite.tasks), 'task')}: {suite.digest}"
     columns = ("axis", "task", "level", ">DQN", ">PPO", ">table")
     print_table(title, columns, rows, before=[setting, ""], notes=[" ".join(notes)])
-
-
-SuiteOption = Annotated[
-    str | None, typer.Option(metavar="NAME|FILE.yaml", help="Suite of the results. Default: theirs.")
-]
 
 
 @app.command("compare")

@@ -66,6 +66,10 @@ def train(
     from pharos.agents import hyperparameters as hyperparameters_of
     from pharos.training import train as learn
 
+    if endless and horizon is not None:
+        raise ParameterError(f"--no-horizon and --horizon {horizon} contradict each other; expected one of them")
+    if seeds is None and device != "cpu":
+        raise ParameterError(f"--device {device} goes with --seeds, as in --seeds {seed}: one run is of the processor")
     agent, hyperparameters = training.agent, training.hyperparameters
     if table is not None:
         sight = agent_called(agent).observation(training.observation)

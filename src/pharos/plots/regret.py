@@ -161,7 +161,8 @@ def _label(config: dict[str, Any], configs: list[dict[str, Any]]) -> str:
     who = agent.title.removeprefix("tabular ") + (f" ({observation})" if is_shown else "")
     parts = [f"{who} on {_in_words(config)}", f"{_spaced(config['steps'])} steps"]
     if differ("chance"):
-        parts.append(" ".join(f"{name}={p:g}" for name, p in config["chance"].items() if p) or "no chance")
+        knobs = {name: p if isinstance(p, str) else f"{p:g}" for name, p in config["chance"].items() if p}
+        parts.append(" ".join(f"{name}={p}" for name, p in knobs.items()) or "no chance")
     if differ("hyperparameters"):
         hyperparameters = config["hyperparameters"]
         parts.append(" ".join(f"{name}={hyperparameters[name]}" for name in hyperparameters if _varies(name, configs)))
@@ -199,6 +200,8 @@ def _aligned(runs: list[tuple[dict[str, Any], Any]], column: str) -> tuple[np.nd
     steps = runs[0][1]["step"].to_numpy()
     for _, curve in runs[1:]:
         steps = np.intersect1d(steps, curve["step"].to_numpy())
+    if not len(steps):
+        raise ParameterError("curves of one setting have no evaluated step in common; give these runs one by one")
     return steps, np.stack([curve.set_index("step")[column].loc[steps].to_numpy(float) for _, curve in runs])
 
 

@@ -22,9 +22,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.agents import NETWORK, POLICY, Learner, agent_called
+from pharos.agents import NETWORK, POLICY, Learner, agent_called, agents, read_policy_table
 from pharos.errors import FileFormatError, MissingExtra, ParameterError, ResultCorrupted, UntrustedCode
 from pharos.system import storage
+from pharos.system.sources import is_reference
 from pharos.system.storage import CLAIM, LOCK, check_regular, digest_of_bytes, digest_of_file, read_json, sync
 from pharos.training.task import RunConfig, Task, run_id
 
@@ -501,6 +502,8 @@ def load_agent(folder: str | os.PathLike, *, trust: bool = False) -> tuple[Task,
     try:
         config = RunConfig.from_dict(record["config"])
         task = config.task(trust=trust)
+        if config.agent not in agents() and not is_reference(config.agent):  # the label of a loop of the user's own
+            return task, _policy_of_loop(folder)
         tasks = TaskCache(trust=trust)
         tasks.adopt(config, task)
         run = PreparedRun(None, config, None, tasks)
@@ -511,3 +514,13 @@ def load_agent(folder: str | os.PathLike, *, trust: bool = False) -> tuple[Task,
     except FileFormatError as error:
         raise FileFormatError(f"{folder / 'run.json'}: {error}") from error
     return task, agent_called(config.agent).load(folder, run)
+
+
+def _policy_of_loop(folder: Path) -> np.ndarray:
+    """The last table that a `pharos.Run` has recorded. FileFormatError: it has recorded something else."""
+    if not (folder / POLICY).exists():
+        raise FileFormatError(
+            f"{folder}: a loop of your own keeps its policy if that is a table of states; record one, or save your "
+            "network yourself, and give it to pharos.evaluate_policy"
+        )
+    return read_policy_table(folder)
