@@ -105,6 +105,25 @@ def runs_of(lab):
 
 
 @pytest.mark.long
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("corridor.py:Kinds", "flag=no"), "Kinds: flag='no'; expected true or false"),
+        (("corridor.py:Kinds", "count=4.5"), "Kinds: count=4.5; expected an integer"),
+        (("corridor.py:Kinds", "share=abc"), "Kinds: share='abc'; expected a number"),
+        (("corridor.py",), "corridor.py is code; name a class in it, such as corridor.py:Kinds"),
+    ],
+)
+def test_parameters_of_ones_own_class_are_of_the_kind_that_it_says(tmp_path, monkeypatch, words, said):
+    monkeypatch.chdir(tmp_path)
+    fields = "    flag: bool = True\n    count: int = 4\n    share: float = 0.5\n    free: object = None\n"
+    text = "from dataclasses import dataclass\nfrom pharos.environments import SimpleGrid\n\n"
+    text += f'@dataclass(frozen=True, kw_only=True)\nclass Kinds(SimpleGrid):\n    name = "kinds"\n{fields}'
+    (tmp_path / "corridor.py").write_text(text, encoding="utf-8")
+    assert said in run("build", *words, "--out", tmp_path / "space").output
+    assert run("build", "corridor.py:Kinds", "flag=0", "free=no", "--out", tmp_path / "space").exit_code == 0
+
+
 def test_a_study_keeps_where_its_code_comes_from(lab):
     records = runs_of(lab)
     assert set(records) == {"index", "corner", "pair"}

@@ -85,6 +85,33 @@ def test_two_comparisons_of_one_number_narrow_it():
 
 
 @pytest.mark.parametrize(
+    "draw",
+    [
+        lambda rng: rng.choice(3),
+        lambda rng: rng.choice(3, p=[0.2, 0.3, 0.5]),
+        lambda rng: rng.choice([0, 1]),
+        lambda rng: rng.choice(["a", "b"]),
+        lambda rng: rng.choice([1.5, 2]),
+        lambda rng: rng.choice([True, False]),
+        lambda rng: rng.choice([(0, 1), (1, 2)]),
+        lambda rng: rng.choice([None, 1]),
+        lambda rng: rng.choice(4, 2),
+        lambda rng: rng.binomial(2, 0.5),
+        lambda rng: rng.integers(3),
+    ],
+)
+def test_draws_have_the_types_of_numpy(draw):
+    """What an environment keeps is compared with what it keeps when it is played with NumPy's own generator."""
+    drawn = []
+    distribution(lambda rng: drawn.append(draw(rng)))
+    rng = np.random.default_rng(0)
+    own = {str(value): value for value in (draw(rng) for _ in range(200))}
+    for value in drawn:
+        assert type(value) is type(own[str(value)])
+        assert getattr(value, "dtype", None) == getattr(own[str(value)], "dtype", None)
+
+
+@pytest.mark.parametrize(
     "draw", [lambda rng: rng.random() ** 2, lambda rng: rng.normal(), lambda rng: float(rng.random())]
 )
 def test_numbers_themselves_are_refused(draw):

@@ -25,6 +25,29 @@ from refusals import refusal
 from strategies import deterministic_mdps, examples, probabilities, small_mdps
 
 
+@pytest.mark.parametrize(
+    ("initial", "states", "probabilities"),
+    [
+        (2, [2], [1.0]),
+        ([0, 0, 2], [0, 2], [2 / 3, 1 / 3]),
+        ([1, 0, 0, 0], [0], [1.0]),
+        ([0, 0, 1, 0], [2], [1.0]),
+        ([0, 1, 2, 3], [0, 1, 2, 3], [0.25] * 4),
+        ([0.0, 0.5, 0.5, 0.0], [1, 2], [0.5, 0.5]),
+    ],
+)
+def test_one_of_all_states_that_is_1_is_a_probability(initial, states, probabilities):
+    """An array (S,) of a 1 and else 0 had been taken for the states 1 and 0."""
+    mdp = TabularMDP.from_arrays([[1], [2], [3], [3]], np.zeros((4, 1)), initial=initial)
+    assert mdp.start_states.tolist() == states
+    assert mdp.start_probabilities == pytest.approx(probabilities)
+
+
+def test_of_two_states_0_and_1_are_the_states():
+    mdp = TabularMDP.from_arrays([[1], [1]], [[1.0], [0.0]], initial=[0, 1])
+    assert mdp.start_probabilities.tolist() == [0.5, 0.5]
+
+
 @examples(100, hnp.arrays(np.float64, st.tuples(st.integers(1, 40), st.integers(1, 3)), elements=st.floats(-1e6, 1e6)))
 def test_rewards_are_kept_to_the_last_bit(array):
     assert (Rewards.from_array(array).array == array).all()

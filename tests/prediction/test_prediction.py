@@ -12,7 +12,7 @@ import pharos
 from command_line import run
 from pharos import hardness, importers
 from pharos.agents import agent_called, primary_predictors
-from pharos.errors import ParameterError, UndefinedMeasure
+from pharos.errors import ParameterError, UndefinedMeasure, UnknownName
 from pharos.hardness.representation import network_regret as network_regret_module
 from pharos.observations import representation
 from pharos.prediction import Published, prediction, published
@@ -150,6 +150,13 @@ def test_what_nobody_declares_is_not_named_as_another_hyperparameter():
         said = pharos.predict("river_swim", length=5, steps=1500, agent="dqn", hyperparameters={**declared, **changed})
         lines = [line for line in said.warnings if "--hyperparameters" in line]
         assert len(lines) == bool(named) and all(line.startswith(named) for line in lines)
+
+
+def test_hyperparameters_that_the_agent_lacks_are_refused_and_those_without_effect_named():
+    with pytest.raises(UnknownName, match="did you mean 'learning_rate'"):
+        pharos.predict("river_swim", length=5, hyperparameters={"learning_rat": 0.1})
+    said = pharos.predict("river_swim", length=5, steps=1500, hyperparameters={"tau": 0.5}).warnings
+    assert any(line.startswith("tau: no part of the idealised learner") for line in said)
 
 
 def test_a_unit_outside_of_what_was_tested_is_named():

@@ -622,3 +622,44 @@ def test_chance_must_be_the_same_compiled():
         return float((1 + state[0]) << LAST_BIT)
 
     assert "reward of outcome 0 of action 'left' in state (position=0) is -9" in message(windy(reward=reward))
+
+
+# A look at a few states before a build ------------------------------------------------------------------------------
+
+
+def leads_by_half(self, state, action, out):
+    out[0] = state[0] + 0.5
+
+
+@pytest.mark.parametrize(
+    ("attributes", "said"),
+    [
+        ({"transition": lambda self, state, action, out: (0,)}, "returns (0,); expected nothing"),
+        ({"transition": leads_by_half}, "writes position = 0.5; expected an integer"),
+        ({"reward": lambda self, state, action, next_state: "1"}, "is '1'; expected a finite number"),
+        ({"reward": lambda self, state, action, next_state: float(next(COUNTER))}, "expected the same answer"),
+        (
+            {
+                "probability": lambda self, state, action, outcome: 0.7,
+                "transition": lambda self, state, action, outcome, out: None,
+            },
+            "those of outcomes 0 to 0 sum to 0.7; expected 1",
+        ),
+    ],
+)
+def test_rules_that_a_build_would_misunderstand_are_refused_before_it(tmp_path, attributes, said):
+    with pytest.raises(RuleError) as error:
+        pharos.build(corridor(**attributes), tmp_path / "space")
+    assert said in str(error.value)
+
+
+def test_truth_as_a_number_whole_floats_and_actions_that_are_not_there_are_taken_as_ever(tmp_path):
+    def transition(self, state, action, out):
+        out[0] = float(state[0] + 1 if action == 1 else state[0] - 1)
+
+    attributes = {
+        "is_terminal": lambda self, state: int(state[0] == self.length - 1),
+        "is_available": lambda self, state, action: int(action == 1 or state[0] > 0),
+        "transition": transition,
+    }
+    assert pharos.build(corridor(**attributes), tmp_path / "space").num_states == 5

@@ -142,6 +142,22 @@ def check_parameters(env: object) -> None:
     declared = declared_parameters(type(env))
     for name in sorted(declared, key=lambda name: declared[name].is_bounded_by_others):
         store(env, name, declared[name].checked(env, name, getattr(env, name)))
+    for each in dataclasses.fields(env) if dataclasses.is_dataclass(env) else ():
+        if each.name not in declared:
+            _check_annotated(env, each.name, each.type)
+
+
+def _check_annotated(env: object, name: str, annotation: object) -> None:
+    """ParameterError if a field that is annotated as bool, int or float is something else: `flag=no` is a text."""
+    value, kind = getattr(env, name), getattr(annotation, "__name__", annotation)
+    if value is None:
+        return
+    if kind == "bool" and (isinstance(value, str) or value not in (True, False)):
+        raise ParameterError(f"{type(env).__name__}: {name}={value!r}; expected true or false")
+    if kind == "int" and (isinstance(value, str) or (isinstance(value, float) and not value.is_integer())):
+        raise ParameterError(f"{type(env).__name__}: {name}={value!r}; expected an integer")
+    if kind == "float" and isinstance(value, str):
+        raise ParameterError(f"{type(env).__name__}: {name}={value!r}; expected a number")
 
 
 def store(env: object, name: str, value: T) -> T:

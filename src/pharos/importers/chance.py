@@ -345,6 +345,11 @@ def _array_of(items: Sequence[object]) -> np.ndarray:
     return array
 
 
+_CHOSEN = type(np.random.default_rng(0).choice(2))
+"""Of a number below another one that `choice` draws: int, or a type of NumPy, by its version."""
+_COUNTED = type(np.random.default_rng(0).binomial(1, 0.5))
+
+
 class BranchingGenerator:
     """Stands in for the generators of NumPy: `Generator` and `RandomState`."""
 
@@ -414,12 +419,15 @@ class BranchingGenerator:
         axis: int = 0,
         shuffle: bool = True,
     ) -> object:
-        """One of several things, or an array of them; equal things are one outcome."""
-        items = list(range(int(a))) if np.ndim(a) == 0 and not isinstance(a, list | tuple) else list(a)
+        """One of several things, or an array of them; equal things are one outcome.
+
+        Of the types that NumPy returns: environments keep what they have drawn in their states.
+        """
+        items: list[Any]
+        items = [*map(_CHOSEN, range(int(a)))] if np.ndim(a) == 0 else [*np.moveaxis(np.asarray(a), axis, 0)]
         weights = None if p is None else _normalized(p)
         if size is None:
-            drawn = self._one_of(items, weights)
-            return np.int64(drawn) if isinstance(drawn, int) and not isinstance(drawn, bool) else drawn
+            return self._one_of(items, weights)
         if replace:
             return self._many(size, lambda: self._one_of(items, weights))
         if weights is not None:
@@ -462,7 +470,7 @@ class BranchingGenerator:
             return self._many(size, lambda: self.binomial(n, p))
         q = _exact(p)
         weights = [math.comb(int(n), k) * q**k * (1 - q) ** (int(n) - k) for k in range(int(n) + 1)]
-        return np.int64(self._index(len(weights), weights))
+        return _COUNTED(self._index(len(weights), weights))
 
     def multinomial(self, n: int, pvals: object, size: npt.ArrayLike | None = None) -> object:
         """Counts of each outcome in n trials."""

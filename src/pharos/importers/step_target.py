@@ -55,6 +55,9 @@ class NamedCode:
     def function(self) -> Callable[..., Any]:
         """The function itself; ParameterError if there is none."""
         function = sources.load_source(self.source)
+        if function is None:
+            where, _, name = self.name.rpartition(":")
+            raise ParameterError(f"{self.name!r}: there is no {name!r} in {where}; expected a function or a class")
         if not callable(function):
             raise ParameterError(f"{self.name!r}: is {function!r}; expected a function or a class of that name")
         return function

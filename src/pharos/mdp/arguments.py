@@ -125,8 +125,14 @@ def terminal_states(terminal: npt.ArrayLike | None, default: np.ndarray, allowed
 
 
 def start_of(initial: npt.ArrayLike, num_states: int) -> tuple[np.ndarray, np.ndarray]:
-    """(start states (K,), their probabilities (K,)) of a state, several states, or (S,) probabilities."""
+    """(start states (K,), their probabilities (K,)) of a state, several states, or (S,) probabilities.
+
+    S integers of which one is 1 and the others are 0 are probabilities; of two states 0, 1 are the states.
+    """
     start = np.asarray(initial)
+    is_row = start.dtype.kind in "iu" and start.shape == (num_states,) and num_states > 2
+    if is_row and start.max() == 1 and (np.sort(start)[:-1] == 0).all():
+        start = start.astype(np.float64)
     if start.dtype.kind in "iu" and start.ndim == 0:
         states, probabilities = start.reshape(1), np.ones(1)
     elif start.dtype.kind in "iu" and start.ndim == 1 and len(start):

@@ -33,7 +33,7 @@ def from_arrays(
         next_states: (S, A) integers in [-1, S). -1 ends the episode after the transition's reward.
         rewards: (S, A) finite numbers, or -inf for actions that are not available.
         gamma: discount, in [0, 1].
-        initial: a start state, a sequence of equally likely ones (fewer than S), or (S,) probabilities.
+        initial: a start state, a sequence of equally likely ones, or (S,) probabilities (floats, or a single 1).
         horizon: number of steps of an episode, or None.
         terminal: (S,) bool, the terminal states, whose rows must lead to themselves (or be -1) with reward 0. None:
             the states whose whole row is -1 with reward 0.

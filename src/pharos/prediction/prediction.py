@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.agents import agent_called, primary_predictors
+from pharos.agents import agent_called, check_hyperparameters, primary_predictors
 from pharos.environments import Environment
-from pharos.errors import ParameterError
+from pharos.errors import MissingExtra, ParameterError, UnknownName
 from pharos.prediction.calibration import COMMON, LEVEL, OrderCounts, Published, published
 from pharos.prediction.learners import PrimaryRegret, primary_regret
 from pharos.prediction.pilot import pilot_regret, plane
@@ -252,6 +252,7 @@ def predict(
         raise ParameterError("predictions are of episodes of some number of steps; found horizon none; give a number")
     parameters = {name: value for name, value in options.items() if name not in TAKEN}
     env, chance = Task.of(environment, parameters).env, training.chance
+    unused = _unused_hyperparameters(agent, training.hyperparameters or {})
     overrides = {**(COMMON[agent] if common else {}), **(training.hyperparameters or {})}
     width, cells, states, spread = covering.half_width(), [], 0, math.nan
     # A cell for each observation and network
@@ -302,6 +303,7 @@ def predict(
             *_warnings(calibration, states, steps, spread, chance),
             *_stand_ins(agent, cells),
             *_other_hyperparameters(agent, settings),
+            *unused,
         ),
         hyperparameters=settings,
     )
@@ -405,6 +407,22 @@ def _stand_ins(agent: str, cells: Iterable[PredictedRegret]) -> Iterable[str]:
             f"{labels}: predicted by {measure}, as {predictor} is for at most 4,096 different observations without "
             "landmarks, and networks whose output layer is known; the interval is not calibrated here"
         )
+
+
+def _unused_hyperparameters(agent: str, given: Mapping[str, Any]) -> list[str]:
+    """A line if hyperparameters are no part of the idealised learner. UnknownName: nor has the agent one of them."""
+    from pharos.agents.batched import OWN_OPTIONS
+
+    own = agent_called(agent)
+    used = {*COMMON[agent], *own.defaults, *own.space, "net_arch", "max_grad_norm", "vf_coef"}
+    further = [name for name in given if name not in used]
+    if not further:
+        return []
+    try:
+        check_hyperparameters(agent, {name: given[name] for name in further}, OWN_OPTIONS)
+    except MissingExtra:
+        raise UnknownName(f"hyperparameter of {agent}", further[0], sorted(used)) from None
+    return [f"{', '.join(further)}: no part of the idealised learner, which learns the same without"]
 
 
 def _other_hyperparameters(agent: str, settings: Mapping[str, Any]) -> Iterable[str]:

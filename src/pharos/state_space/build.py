@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError, StateSpaceLocked, StateSpaceMismatch
+from pharos.state_space.guarded_rules import FirstLook
 from pharos.state_space.manifest import ARRAYS, MANIFEST, PART_NAMES, Plan, lock_build, read_manifest
 from pharos.state_space.progress import BuildCallback, reporter
 from pharos.state_space.store import StateSpace, load
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
 OUR_FILES = (*ARRAYS, *PART_NAMES.values(), SHARDS, MANIFEST + ".tmp", storage.LOCK, storage.CLAIM)
 BUILD_CHECKPOINT_SECONDS = 15.0
+LOOKED_AT = 100
+"""States of a class of the user's own that are looked at, interpreted, before its state space is built."""
 Hold = Callable[[Path], contextlib.AbstractContextManager[object]]  # of a folder, for one builder
 
 
@@ -124,6 +127,8 @@ def _build(
         raise ParameterError(f"{path}: cannot be made a folder: {error.strerror}; choose another one") from error
     with hold(path), reporter(progress, plan.env) as report:
         manifest = _manifest_of(plan, path)  # it may have grown while we waited
+        if manifest is None and not type(plan.env).__module__.startswith("pharos."):
+            FirstLook(plan.env).states(LOOKED_AT)
         if manifest is None or not manifest["complete"]:
             search = plan, journal_of(path, plan), options, report
             (Search(*search) if rank is None else RankedSearch(*search, rank)).run(manifest)

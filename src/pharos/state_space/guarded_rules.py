@@ -3,12 +3,13 @@
 import math
 import numbers
 import operator
+from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
-from pharos.environments import Environment, Layer, State
+from pharos.environments import Environment, Layer, State, start_distribution
 from pharos.errors import RuleError
 from pharos.system.arrays import SUM_TOLERANCE
 
@@ -274,3 +275,51 @@ class InterpretedCheck:
         if len(state) > 8:
             return str(state)
         return "(" + ", ".join(f"{n}={v}" for n, v in zip(self.components.names, state, strict=True)) + ")"
+
+
+class _NotLooked(Exception):
+    """Raised when a rule fails, which the build itself tells better."""
+
+
+class FirstLook(InterpretedCheck):
+    """The rules of a few states: what a build would take in changed is refused, and all else is left to it.
+
+    Truth may be a number here, and integers may be floats without a fraction, as compiled rules take both.
+    """
+
+    def states(self, most: int) -> None:
+        """Look at the states nearest to the start. RuleError: the first breach."""
+        queue = deque(start_distribution(self.env)[0])
+        known = set(queue)
+        while queue and len(self.terminal) < most:
+            try:
+                successors = self.expand(queue.popleft())
+            except _NotLooked:
+                return
+            for state in successors:
+                if state not in known:
+                    known.add(state)
+                    queue.append(state)
+
+    def _is_terminal(self, state: State) -> bool:
+        return bool(self._call("", self.env.is_terminal, _ReadOnly(state)))
+
+    def _set(self, state: State) -> tuple[bool, ...]:
+        actions = range(self.env.num_actions)
+        return tuple(bool(self._call("", self.env.is_available, _ReadOnly(state), action)) for action in actions)
+
+    def _probabilities(self, state: State, action: int) -> list[float]:
+        """None of an action that is not available: its rules are never asked."""
+        return super()._probabilities(state, action) if self.sets.get(state, (True,) * (action + 1))[action] else []
+
+    def _checked(self, where: str, out: list) -> State:
+        whole = (float, np.floating)
+        return super()._checked(where, [int(x) if isinstance(x, whole) and x.is_integer() else x for x in out])
+
+    def _call(self, where: str, rule: Callable, *arguments) -> Any:
+        try:
+            return rule(*arguments)
+        except _StateWritten:
+            raise RuleError(f"{where} writes to its state; expected it to be read only") from None
+        except Exception as error:
+            raise _NotLooked from error

@@ -18,6 +18,7 @@ from pharos.agents import agent_called, agent_name
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment
 from pharos.errors import AllRunsFailed, ParameterError
+from pharos.mdp.arguments import whole_number
 from pharos.observations import own_observation
 from pharos.system.records import split_options, takes
 from pharos.training.execution import ProgressCallback, Training, TrainingProgress, train_configs
@@ -176,7 +177,13 @@ def _runs(
     """The task, and the configuration of a run with each of the seeds. `options` are the same as for `train`."""
     training, parameters = split_options(TrainingOptions, options)
     agent, hyperparameters, table = training.agent, training.hyperparameters, options.get("hyperparameters")
+    for seed in seeds:
+        whole_number(seed, "seed", "a whole number, at least 0", least=0)
     name = agent_called(agent).observation(training.observation)
+    if training.observation_options and agent_called(agent).fixed_observation is not None:
+        raise ParameterError(
+            f"{agent} sees {name} whatever is asked for; leave out {', '.join(training.observation_options)}"
+        )
     task = Task.of(
         environment,
         parameters,
