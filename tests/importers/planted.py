@@ -136,6 +136,15 @@ class StartsAnywhere(Walk):
         return self.cell, {}
 
 
+class Place(Walk):
+    """Begins at the wall, so that its place is the least number of steps to it."""
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.cell = 0
+        return self.cell, {}
+
+
 class Clock(Walk):
     """Counts its steps, and ends by that."""
 

@@ -387,6 +387,12 @@ def test_a_clock_is_named_and_left_out_on_demand():
     assert recording.notes == ()
 
 
+def test_a_place_that_begins_at_0_is_no_clock():
+    """A step against the wall stays at 0, though each new place is one step farther."""
+    _, recording = importers.stepping(planted.Place)
+    assert recording.notes == ()
+
+
 def test_what_is_ignored_must_not_matter():
     with pytest.raises(
         RuleError, match=r"behave differently \(actions [01, ]+: reward \d+ and \d+\): --ignore leaves out"

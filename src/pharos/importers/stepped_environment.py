@@ -517,6 +517,15 @@ class ClockSearch:
             self.fields = {name: value - depth for name, value in values.items()}
         self.fields = {name: at for name, at in self.fields.items() if values.get(name) == at + depth}
 
+    def hold_against(self, states: SteppedStates) -> "ClockSearch":
+        """Itself, without any field if a step leads to a state that is not one step farther from the start."""
+        outcomes, depths = states.outcomes(), np.array(states.depths)
+        rows = np.repeat(np.arange(len(outcomes.offsets) - 1), np.diff(outcomes.offsets))
+        goes_on = outcomes.next_states >= 0
+        if (depths[outcomes.next_states[goes_on]] != depths[rows[goes_on] // states.num_actions] + 1).any():
+            self.fields = {}
+        return self
+
     def lines(self) -> list[str]:
         """A line for each clock."""
         names = sorted(self.fields or ()) if self.num_depths > 2 else []

@@ -163,6 +163,7 @@ class SteppingRun:
         gamma = gamma if gamma is not None else 0.99 if self.horizon is None else 1.0
         mdp, outcomes = mdp_of(states, gamma=gamma, horizon=self.horizon)
         observations, observed = source.observer.stacked(states.observations)
+        clocks = clocks.hold_against(states)
         notes = (*clocks.lines(), *source.observer.notes, *(f"{source.name}: {line}" for line in source.effects.lines))
         limit, depths = source.time_limit, np.array(states.depths)
         return mdp, StepRecording(observations, observed, outcomes, source.action_names, limit, depths, notes)
@@ -175,7 +176,7 @@ class SteppingRun:
             source,
             horizon=self.horizon,
             max_states=self.max_states,
-            too_large=lambda states: _too_large(source.name, states, clocks.lines()),
+            too_large=lambda states: _too_large(source.name, states, clocks.hold_against(states).lines()),
             on_state=clocks.look,
         )
         if progress is not None:
