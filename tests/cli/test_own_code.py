@@ -121,7 +121,9 @@ def test_parameters_of_ones_own_class_are_of_the_kind_that_it_says(tmp_path, mon
     text += f'@dataclass(frozen=True, kw_only=True)\nclass Kinds(SimpleGrid):\n    name = "kinds"\n{fields}'
     (tmp_path / "corridor.py").write_text(text, encoding="utf-8")
     assert said in run("build", *words, "--out", tmp_path / "space").output
-    assert run("build", "corridor.py:Kinds", "flag=0", "free=no", "--out", tmp_path / "space").exit_code == 0
+    assert (
+        run("build", "corridor.py:Kinds", "flag=0", "free=no", "count=4.0", "--out", tmp_path / "space").exit_code == 0
+    )
 
 
 def test_a_study_keeps_where_its_code_comes_from(lab):

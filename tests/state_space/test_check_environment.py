@@ -663,3 +663,22 @@ def test_truth_as_a_number_whole_floats_and_actions_that_are_not_there_are_taken
         "transition": transition,
     }
     assert pharos.build(corridor(**attributes), tmp_path / "space").num_states == 5
+
+
+@pytest.mark.parametrize(
+    ("attributes", "said"),
+    [
+        ({"actions": ()}, "actions is (); expected a tuple of different names"),
+        ({"actions": 2}, "actions is 2; expected a tuple of different names"),
+        ({"variables": lambda self: [range(3)]}, "variables() or initial_state() fails: AttributeError"),
+        ({"variables": lambda self: {0: range(3)}}, "variables() or initial_state() fails: TypeError"),
+        ({"initial_state": lambda self: 0}, "variables() or initial_state() fails: TypeError"),
+        ({"initial_states": lambda self: [(0,), (1,)]}, "variables() or initial_state() fails: ValueError"),
+        ({"max_episode_steps": "10"}, "max_episode_steps is '10'; expected an integer"),
+        ({"max_episode_steps": 2.5}, "max_episode_steps is 2.5; expected an integer"),
+    ],
+)
+def test_declarations_that_no_build_can_begin_with_are_one_line(tmp_path, attributes, said):
+    with pytest.raises(RuleError) as error:
+        pharos.build(corridor(**attributes), tmp_path / "space")
+    assert said in str(error.value) and "\n" not in str(error.value)

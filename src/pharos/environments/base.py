@@ -156,6 +156,8 @@ def _check_annotated(env: object, name: str, annotation: object) -> None:
         raise ParameterError(f"{type(env).__name__}: {name}={value!r}; expected true or false")
     if kind == "int" and (isinstance(value, str) or (isinstance(value, float) and not value.is_integer())):
         raise ParameterError(f"{type(env).__name__}: {name}={value!r}; expected an integer")
+    if kind == "int" and isinstance(value, float):
+        store(env, name, int(value))
     if kind == "float" and isinstance(value, str):
         raise ParameterError(f"{type(env).__name__}: {name}={value!r}; expected a number")
 

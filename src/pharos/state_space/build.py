@@ -8,6 +8,7 @@ appends both to files and commits them.
 import contextlib
 import hashlib
 import json
+import math
 import os
 import warnings
 from collections.abc import Callable
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pharos.environments import Environment, make
-from pharos.errors import ParameterError, StateSpaceLocked, StateSpaceMismatch
+from pharos.errors import ParameterError, PharosError, RuleError, StateSpaceLocked, StateSpaceMismatch
 from pharos.state_space.guarded_rules import FirstLook
 from pharos.state_space.manifest import ARRAYS, MANIFEST, PART_NAMES, Plan, lock_build, read_manifest
 from pharos.state_space.progress import BuildCallback, reporter
@@ -93,9 +94,18 @@ def build(
     if memory is not None and memory < machine.LEAST_MEMORY:
         raise ParameterError(f"memory is {memory} bytes; expected at least 16 MiB")
     check_processes(processes)
-    plan = Plan(env)
-    path = Path(folder) if folder is not None else folder_of(plan)
     options = Options(max_states, memory, workers, checkpoint_seconds)
+    plan = Plan(env)
+    try:
+        path = Path(folder) if folder is not None else folder_of(plan)
+        _ = plan.identity
+    except PharosError:
+        raise
+    except Exception:  # of declarations of the user's own
+        from pharos.state_space.conformance import check_declarations
+
+        check_declarations(env)
+        raise
     with rank_of_build(plan, memory) if processes == "mpi" else contextlib.nullcontext() as rank:
         hold = _waiting if (folder is None if wait is None else wait) else lock_build
         was_there = (rank is None or rank.rank == 0) and _build(plan, path, rank, options, progress, hold)
@@ -128,11 +138,21 @@ def _build(
     with hold(path), reporter(progress, plan.env) as report:
         manifest = _manifest_of(plan, path)  # it may have grown while we waited
         if manifest is None and not type(plan.env).__module__.startswith("pharos."):
-            FirstLook(plan.env).states(LOOKED_AT)
+            _look_at(plan.env)
         if manifest is None or not manifest["complete"]:
             search = plan, journal_of(path, plan), options, report
             (Search(*search) if rank is None else RankedSearch(*search, rank)).run(manifest)
     return False
+
+
+def _look_at(env: Environment) -> None:
+    """RuleError if a class of the user's own has what a build would take in changed."""
+    steps = env.max_episode_steps
+    if isinstance(steps, str) or (isinstance(steps, float) and math.isfinite(steps) and not steps.is_integer()):
+        raise RuleError(f"{env}: max_episode_steps is {steps!r}; expected an integer of at least 1")
+    if not env.num_actions:
+        raise RuleError(f"{env}: actions is {env.actions!r}; expected a tuple of different names, at least one")
+    FirstLook(env).states(LOOKED_AT)
 
 
 def _waiting(path: Path) -> contextlib.ExitStack:
