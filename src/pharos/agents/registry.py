@@ -85,9 +85,9 @@ def hyperparameters(
         agents_of_table = _read(table)
         entries = agents_of_table.get(agent) or {}
         if not {"default", environment} & set(entries):
-            found = ", ".join(entries) or f"only {', '.join(agents_of_table) or 'nothing'}"
+            content = ", ".join(entries) or f"only {', '.join(agents_of_table) or 'nothing'}"
             raise ParameterError(
-                f"{table} says nothing of {agent} in {environment}; found {found}; expected {agent}, then "
+                f"{table} says nothing of {agent} in {environment}; found {content}; expected {agent}, then "
                 f"{environment} or default"
             )
         default, by_observation = entries.get("default"), entries.get(environment) or {}

@@ -15,7 +15,6 @@ from pharos.agents import AGENT_LIBRARIES, agent_called, agents, algorithm, extr
 from pharos.benchmark.entry import POLICY_ARRAY, Entry
 from pharos.environments import BUILT_IN
 from pharos.errors import FileFormatError, ParameterError, StateSpaceTooLarge, UntrustedCode
-from pharos.mdp.actions import RANGE
 from pharos.observations import names as observation_names
 from pharos.observations import observe
 from pharos.policies import PolicyLike, deep_policy
@@ -192,7 +191,7 @@ def task_of(entry: Entry, trust: bool, max_states: int, values: MutableMapping[s
     config = entry.config
     _check_code(config, trust)
     for name, value in config.chance.to_dict().items():
-        if (name, value) == ("scale_rewards", RANGE):
+        if (name, value) == ("scale_rewards", "range"):
             continue
         if type(value) not in (int, float):
             raise FileFormatError(f"its {name} is {str(value)[:40]!r}; expected a number")

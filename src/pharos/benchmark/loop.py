@@ -20,7 +20,7 @@ from pharos.benchmark.execution import claimed, collected
 from pharos.benchmark.suite import BenchmarkTask, Suite, load_suite
 from pharos.environments import Environment, class_called
 from pharos.errors import AllRunsFailed, FolderLocked, ParameterError
-from pharos.mdp.arguments import whole_number
+from pharos.mdp import whole_number
 from pharos.observations import own_observation
 from pharos.policies import PolicyLike
 from pharos.system import storage

@@ -409,17 +409,17 @@ def _stand_ins(agent: str, cells: Iterable[PredictedRegret]) -> Iterable[str]:
         )
 
 
-def _unused_hyperparameters(agent: str, given: Mapping[str, Any]) -> list[str]:
+def _unused_hyperparameters(agent: str, overrides: Mapping[str, Any]) -> list[str]:
     """A line if hyperparameters are no part of the idealised learner. UnknownName: nor has the agent one of them."""
     from pharos.agents.batched import OWN_OPTIONS
 
     own = agent_called(agent)
     used = {*COMMON[agent], *own.defaults, *own.space, "net_arch", "max_grad_norm", "vf_coef"}
-    further = [name for name in given if name not in used]
+    further = [name for name in overrides if name not in used]
     if not further:
         return []
     try:
-        check_hyperparameters(agent, {name: given[name] for name in further}, OWN_OPTIONS)
+        check_hyperparameters(agent, {name: overrides[name] for name in further}, OWN_OPTIONS)
     except MissingExtra:
         raise UnknownName(f"hyperparameter of {agent}", further[0], sorted(used)) from None
     return [f"{', '.join(further)}: no part of the idealised learner, which learns the same without"]

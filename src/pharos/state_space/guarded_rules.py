@@ -278,7 +278,7 @@ class InterpretedCheck:
 
 
 class _NotLooked(Exception):
-    """Raised when a rule fails, which the build itself tells better."""
+    """Raised where a rule fails as the build itself tells it."""
 
 
 class FirstLook(InterpretedCheck):
@@ -290,16 +290,17 @@ class FirstLook(InterpretedCheck):
     def states(self, most: int) -> None:
         """Look at the states nearest to the start. RuleError: the first breach."""
         queue = deque(start_distribution(self.env)[0])
-        known = set(queue)
+        states = set(queue)
         while queue and len(self.terminal) < most:
             try:
                 successors = self.expand(queue.popleft())
-            except _NotLooked:
+            except (_NotLooked, OverflowError):
                 return
-            for state in successors:
-                if state not in known:
-                    known.add(state)
-                    queue.append(state)
+            queue.extend(state for state in dict.fromkeys(successors) if state not in states)
+            states.update(successors)
+
+    def _check_age(self, state: State, action: int, outcome: int, successor: State) -> None:
+        """Nothing: a build compares all ages."""
 
     def _is_terminal(self, state: State) -> bool:
         return bool(self._call("", self.env.is_terminal, _ReadOnly(state)))
@@ -310,16 +311,32 @@ class FirstLook(InterpretedCheck):
 
     def _probabilities(self, state: State, action: int) -> list[float]:
         """None of an action that is not available: its rules are never asked."""
-        return super()._probabilities(state, action) if self.sets.get(state, (True,) * (action + 1))[action] else []
+        if state in self.sets and not self.sets[state][action]:
+            return []
+        try:
+            return super()._probabilities(state, action)
+        except RuleError:
+            if self.env.outcomes > 1:
+                raise _NotLooked from None
+            raise
 
     def _checked(self, where: str, out: list) -> State:
-        whole = (float, np.floating)
-        return super()._checked(where, [int(x) if isinstance(x, whole) and x.is_integer() else x for x in out])
+        whole = [int(x) if isinstance(x, float | np.floating) and x.is_integer() else x for x in out]
+        if all(isinstance(x, numbers.Integral | np.bool_) for x in whole):
+            low, high = self.components.low, self.components.high
+            if len(whole) != len(low) or any(not a <= x <= b for a, x, b in zip(low, whole, high, strict=True)):
+                raise _NotLooked
+        return super()._checked(where, whole)
+
+    def _reward(self, state: State, action: int, successor: State, outcome: int) -> float:
+        which = (outcome,) if self.env.pays_by_outcome() else ()
+        reward = self._call("", self.env.reward, _ReadOnly(state), action, _ReadOnly(successor), *which)
+        if isinstance(reward, numbers.Real) and not math.isfinite(reward):
+            raise _NotLooked
+        return super()._reward(state, action, successor, outcome)
 
     def _call(self, where: str, rule: Callable, *arguments) -> Any:
         try:
             return rule(*arguments)
-        except _StateWritten:
-            raise RuleError(f"{where} writes to its state; expected it to be read only") from None
         except Exception as error:
             raise _NotLooked from error

@@ -18,7 +18,7 @@ from pharos.agents import agent_called, agent_name
 from pharos.agents import hyperparameters as hyperparameters_of
 from pharos.environments import Environment
 from pharos.errors import AllRunsFailed, ParameterError
-from pharos.mdp.arguments import whole_number
+from pharos.mdp import whole_number
 from pharos.observations import own_observation
 from pharos.system.records import split_options, takes
 from pharos.training.execution import ProgressCallback, Training, TrainingProgress, train_configs
