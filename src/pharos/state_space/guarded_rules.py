@@ -335,7 +335,7 @@ class FirstLook(InterpretedCheck):
             raise _NotLooked
         return super()._reward(state, action, successor, outcome)
 
-    def _call(self, where: str, rule: Callable, *arguments) -> Any:
+    def _call(self, where: str, rule: Callable, *arguments) -> object:
         try:
             return rule(*arguments)
         except Exception as error:
