@@ -259,7 +259,9 @@ class LoopRun:
         Raises:
             ParameterError: it is no policy, or the step is no number of steps, or not later than the row before.
         """
-        number = int(step) if isinstance(step, float) and step.is_integer() else step
+        number: object = step
+        if isinstance(number, float) and number.is_integer():
+            number = int(number)
         step = whole_number(number, "evaluate: step", "a whole number of steps so far", least=0)
         if policy is None:
             raise ParameterError("evaluate: policy is None; expected a table of states, a model, or a function")

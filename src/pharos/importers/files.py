@@ -97,8 +97,8 @@ def _members(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     try:
         storage.check_regular(path)
         if path.suffix == ".py" and path.exists():
-            names = re.findall(r"^class (\w+)", path.read_text(encoding="utf-8", errors="replace"), re.MULTILINE)
-            raise FileFormatError(f"{path} is code; name a class in it, such as {path}:{(names or ['MyClass'])[0]}")
+            classes = re.findall(r"^class (\w+)", path.read_text(encoding="utf-8", errors="replace"), re.MULTILINE)
+            raise FileFormatError(f"{path} is code; name a class in it, such as {path}:{(classes or ['MyClass'])[0]}")
         if path.exists() and not zipfile.is_zipfile(path):
             advice = "" if path.suffix == ".npz" else f"; {how_to_import(path)}"
             raise FileFormatError(f"{path}: cannot be read as npz: it is no zip archive{advice}")

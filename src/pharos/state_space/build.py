@@ -147,7 +147,7 @@ def _build(
 
 def _look_at(env: Environment) -> None:
     """RuleError if a class of the user's own has what a build would take in changed."""
-    steps = env.max_episode_steps
+    steps: object = env.max_episode_steps
     if isinstance(steps, str) or (isinstance(steps, float) and math.isfinite(steps) and not steps.is_integer()):
         raise RuleError(f"{env}: max_episode_steps is {steps!r}; expected an integer of at least 1")
     if not env.num_actions:
