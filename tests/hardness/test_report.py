@@ -86,6 +86,20 @@ def test_a_users_measure_is_one_line():
         hardness.register("my measure", lambda p: 0.0, definition="mine")
 
 
+@pytest.mark.parametrize(
+    ("outcome", "said"),
+    [
+        ((1.0, 2.0, 3.0, True), "a measure is 1.0, outside of its interval"),
+        ((2.5, 2.0, 3.0, True), "calls the interval [2.0, 3.0] exact"),
+    ],
+)
+def test_exact_is_not_printed_of_a_users_measure_that_is_not(outcome, said):
+    hardness.register("mine", lambda problem: hardness.Certified(*outcome), definition="mine")
+    assert said in refusal(ParameterError, hardness.report, corridor(), "mine")
+    hardness.register("fine", lambda problem: hardness.Certified(2.5, 2.0, 3.0, False), definition="mine")
+    assert hardness.report(corridor(), "fine")["fine"].certificate.kind == "interval"
+
+
 def test_an_undefined_measure_says_why_and_the_others_are_there():
     why = "never is defined for nothing: give up"
     hardness.register("never", failing(UndefinedMeasure(why)), definition="nothing")

@@ -131,6 +131,8 @@ def test_defaults_of_a_study_go_before_those_of_the_library_and_below_those_of_a
         (11, "    agents: []", "specification:11: agents: found []"),
         (12, "    hyperparameters: {dqn: patent}", "specification:12: unknown set of hyperparameters 'patent'; did you mean 'patient'?"),  # noqa: E501
         (12, "    hyperparameters: {a2c: patient}", "specification:12: unknown agent of this block 'a2c'"),
+        (12, "    hyperparameters: {dqn: {learnin_rate: 0.1}}", "specification:12: unknown hyperparameter of dqn 'learnin_rate'; did you mean 'learning_rate'?"),  # noqa: E501
+        (12, "    hyperparameters: {dqn: {learning_rate: a}}", "specification:12: agent 'dqn': learning_rate is 'a'; expected a number above 0"),  # noqa: E501
         (12, "    agents: [dqn]", "specification:12: the key 'agents' stands there twice (line 11)"),
         (12, "    hyperparameters: [", "specification:13"),
         (2, "defaults: {dqm: {frozen_lake: {}}}", "specification:2: unknown agent 'dqm'; did you mean 'dqn'?"),

@@ -241,6 +241,10 @@ class Agent:
     def check(self, hyperparameters: Mapping[str, Any], engine: str) -> None:
         """Raise ParameterError or UnknownName for hyperparameters that the agent lacks, or whose values are wrong."""
 
+    def check_before(self, hyperparameters: Mapping[str, Any], engine: str) -> None:
+        """As `check`, before anything runs: no library is imported for names that are known, or has to be there."""
+        self.check(hyperparameters, engine)
+
     def group_key(self, run: PlannedRun, device: str) -> Hashable | None:
         """Key of a run before its states are built: only runs with equal keys may train together. None: it is alone."""
         return None

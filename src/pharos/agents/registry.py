@@ -234,6 +234,9 @@ class OwnAgent(DeepAgent):
         parameter = inspect.signature(code).parameters.get(name)
         return None if parameter is None or parameter.default is parameter.empty else parameter.default
 
+    def check_before(self, hyperparameters: Mapping[str, Any], engine: str) -> None:
+        """Nothing: its code is not imported before it is trusted."""
+
     def prepare(self, run: LearningRun, device: str, *, is_single: bool) -> Hashable | None:
         form = form_of(self.name, run.algorithm)
         if form == CLASS:

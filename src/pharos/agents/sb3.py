@@ -7,6 +7,7 @@ between representations, not between networks (the pharos paper, section 4.2).
 `DeepAgent` is an agent that trains alone, `BatchedAgent` one that the batched engine has as well.
 """
 
+import contextlib
 import importlib
 import inspect
 import json
@@ -138,6 +139,10 @@ def check_hyperparameters(
         for hyperparameter in hyperparameters:
             if hyperparameter not in names:
                 raise UnknownName(f"hyperparameter of {name}", hyperparameter, names)
+    _check_values(name, hyperparameters)
+
+
+def _check_values(name: str, hyperparameters: Mapping[str, Any]) -> None:
     for hyperparameter, value in hyperparameters.items():
         expected = _expected(hyperparameter, value)
         if expected is not None:
@@ -288,6 +293,12 @@ class DeepAgent(Agent):
 
     def check(self, hyperparameters: Mapping[str, Any], engine: str) -> None:
         check_hyperparameters(self.name, hyperparameters)
+
+    def check_before(self, hyperparameters: Mapping[str, Any], engine: str) -> None:
+        _check_values(_title(self.name), hyperparameters)
+        if not {*hyperparameters} <= {*self.defaults, *self.space, *self.benchmark_defaults}:
+            with contextlib.suppress(MissingExtra):
+                self.check(hyperparameters, engine)
 
     def prepare(self, run: LearningRun, device: str, *, is_single: bool) -> Hashable | None:
         _ = run.algorithm  # or what is wrong with it

@@ -140,13 +140,29 @@ class Certificate:
         return {**fields_of(self, "details"), **self.details}
 
 
+EXACT_WIDTH = 1e-6
+"""Relative width of an interval up to which a `Certified` may call its value exact."""
+
+
 def certificate_of(outcome: object) -> Certificate:
-    """Certificate of a measure's result, from its `exact`, `lower`, `upper` and `note`, if it has them."""
+    """Certificate of a measure's result, from its `exact`, `lower`, `upper` and `note`, if it has them.
+
+    Raises:
+        ParameterError: it is a `Certified` whose interval does not contain its value, or is too wide to be exact.
+    """
     if not hasattr(outcome, "exact"):
         return Certificate("float64", note=getattr(outcome, "note", ""))
     kind = "exact" if outcome.exact else "interval"
     lower, upper = getattr(outcome, "lower", None), getattr(outcome, "upper", None)
     note = getattr(outcome, "note", "")
+    if isinstance(outcome, Certified) and lower is not None and upper is not None:
+        slack = 1e-9 * max(abs(lower), abs(upper)) if math.isfinite(upper - lower) else 0.0
+        if outcome.value < lower - slack or outcome.value > upper + slack:
+            raise ParameterError(f"a measure is {outcome.value}, outside of its interval [{lower}, {upper}]")
+        if outcome.exact and lower != upper and not upper - lower <= 2 * EXACT_WIDTH * max(abs(lower), abs(upper)):
+            raise ParameterError(
+                f"a measure calls the interval [{lower}, {upper}] exact; expected {EXACT_WIDTH:g} of it"
+            )
     return Certificate(kind, lower, upper, note, dict(getattr(outcome, "details", {})))
 
 

@@ -325,6 +325,12 @@ def _wrong(specification: Specification) -> Iterator[tuple[Loc, str]]:
                 yield loc, str(UnknownName("agent of this block", agent, block.agents))
             elif isinstance(own, str) and own not in specification.hyperparameters:
                 yield loc, str(UnknownName("set of hyperparameters", own, specification.hyperparameters))
+            else:
+                values = specification.hyperparameters[own] if isinstance(own, str) else own
+                try:
+                    agent_called(agent).check_before(values, specification.engine_of(block, agent))
+                except ParameterError as error:
+                    yield loc, str(error)
 
 
 def _is_agent(name: str) -> bool:
