@@ -541,3 +541,14 @@ def test_toy_text_keeps_the_names_of_its_documentation(tmp_path):
     rows = json.loads(run("solve", tmp_path / "cliff", "--print-policy", "--json").stdout)["policy_rows"]
     assert [row["name"] for row in rows] == ["up", *["right"] * 11, "down"]
     assert rows[0]["variables"] == {"row": 3, "column": 0}
+
+
+def test_limits_hold_for_the_folder_of_an_imported_mdp_too(tmp_path):
+    mdp = TabularMDP.from_arrays([[1], [2], [2]], [[1.0], [1.0], [0.0]])
+    importers.save(mdp, tmp_path / "three")
+    for words, said in (
+        (("--max-states", 2), "has 3 states; expected at most 2"),
+        (("--memory", "foo"), "--memory 'foo'; expected a size"),
+    ):
+        assert said in run("solve", tmp_path / "three", *words).output
+    assert run("solve", tmp_path / "three", "--max-states", 3).exit_code == 0

@@ -320,7 +320,9 @@ class Target:
         """
         chance = chance or ChanceSetting()
         if self.is_imported:
-            mdp = self._imported(horizon)
+            mdp, most = self._imported(horizon), (building or Building()).options["max_states"]
+            if most is not None and mdp.num_states > most:
+                raise ParameterError(f"{self.path}: has {mdp.num_states} states; expected at most {most}")
             return chance.of(mdp if gamma is None else mdp.with_gamma(gamma))
         space = self.rewarded_space(building)
         by_range = by_range or (building is not None and building.ranks == "mpi")
