@@ -23,7 +23,7 @@ from patience import PATIENCE, wait_for
 from pharos.agents import agents
 from pharos.agents.sb3 import Deep, check_hyperparameters
 from pharos.errors import FileFormatError, ParameterError, ResultCorrupted, UnknownName
-from pharos.training import read_curve, read_record, train, train_config
+from pharos.training import read_curve, read_record, train, train_config, train_many
 from pharos.training.results import CURVE_COLUMNS
 from pharos.training.task import Task
 from refusals import refusal
@@ -42,6 +42,12 @@ def short(agent, out=None, steps=400, seed=1, progress=None, **options):
     hyperparameters = SMALL if agent == "dqn" else {"n_steps": 16} if agent == "ppo" else {}
     options = {"evaluation_interval": 100, "hyperparameters": hyperparameters, "progress": progress, **options}
     return train(agent, "simple_grid/4x4-plain", steps=steps, seed=seed, out=out, **options)
+
+
+def test_seeds_are_whole_numbers_and_several():
+    for seeds, said in ((3, "seeds is 3; expected several"), ([0.5], "seed is 0.5; expected a whole number")):
+        with pytest.raises(ParameterError, match=said):
+            train_many("q_learning", "frozen_lake/4x4", seeds=seeds, steps=100)
 
 
 @pytest.mark.slow

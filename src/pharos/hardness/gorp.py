@@ -91,7 +91,7 @@ def gorp_bound(
     Source: Laidlaw, Russell and Dragan (2023), "Bridging RL theory and practice with the effective horizon", appendix
         C.
     """
-    steps, names = steps_of("gorp_bound", mdp, horizon), tuple(methods)
+    steps, names = steps_of("gorp_bound", mdp, horizon), (methods,) if isinstance(methods, str) else tuple(methods)
     check_returns("gorp_bound", mdp, steps)
     ks = list(range(1, whole_number(max_k, "max_k") + 1))
     for name in names:

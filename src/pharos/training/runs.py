@@ -95,7 +95,9 @@ def train_many(
     Raises:
         ParameterError: no seed, one seed twice, or as for `train`. AllRunsFailed: none has a result.
     """
-    numbers = [int(seed) for seed in seeds]
+    if not isinstance(seeds, Iterable):
+        raise ParameterError(f"seeds is {seeds!r}; expected several, such as range(3)")
+    numbers = [whole_number(seed, "seed", "a whole number, at least 0", least=0) for seed in seeds]
     if not numbers or len(set(numbers)) != len(numbers):
         raise ParameterError(f"seeds are {numbers}; expected at least one, each once")
     name = agent_name(agent)
