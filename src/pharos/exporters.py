@@ -22,9 +22,9 @@ __all__ = ["bridge", "drn", "gym_p"]
 def drn(mdp: TabularMDP, path: str | os.PathLike) -> Path:
     """Write an MDP for Storm, with a reward model "reward" on actions and labels "init" and "terminal".
 
-    Discounting is written out: with gamma < 1 every step ends the episode with probability 1 - gamma, so that Storm's
-    expected total reward `Rmax=? [F "terminal"]` is the discounted value. Several start states become choices of one
-    more, first state.
+    A horizon is not written: the file is of the MDP without one. Discounting is written out: with gamma < 1 every step
+    ends the episode with probability 1 - gamma, so that Storm's expected total reward `Rmax=? [F "terminal"]` is the
+    discounted value. Several start states become choices of one more, first state.
 
     Raises:
         ParameterError: sticky actions (see `gym_p`), or the name does not end in .drn.
@@ -85,6 +85,8 @@ Outcome = tuple[float, int, float, bool]
 def gym_p(mdp: TabularMDP) -> dict[int, dict[int, list[Outcome]]]:
     """Return P[s][a] = [(probability, next state, reward, terminated), ...], as Gymnasium's toy texts have it.
 
+    Discount and horizon are not part of it.
+
     A state has the actions that are available there. The implicit end becomes one more state S, if there is one.
     Random actions are written out as outcomes. Each outcome has its own reward if the MDP is of an environment and has
     its rewards, otherwise the expected reward of what is executed.
@@ -126,6 +128,8 @@ def gym_p(mdp: TabularMDP) -> dict[int, dict[int, list[Outcome]]]:
 def bridge(mdp: TabularMDP, path: str | os.PathLike) -> Path:
     """Write an MDP as BRIDGE does: npz with `transitions` int64 (S, A) and `rewards` float32 (S, A).
 
+    Discount and horizon are not part of it.
+
     States keep their numbers, unless the start is not 0: it then changes places with 0. Transitions into terminal
     states become -1. If all actions of a terminal state end the episode in the table itself, as in BRIDGE's files, it
     stays a state with -1 in each column. Images that the MDP's folder has recorded become `screens` (D, H, W, 3) and
@@ -153,7 +157,10 @@ def bridge(mdp: TabularMDP, path: str | os.PathLike) -> Path:
     start = int(mdp.start_states[0])
     order[[0, start]] = order[[start, 0]]
     table = np.where(table[order] >= 0, order[table[order]], -1)
-    rewards = mdp.rewards[order].astype(np.float32)
+    with np.errstate(over="ignore"):
+        rewards = mdp.rewards[order].astype(np.float32)
+    if not np.isfinite(rewards).all():
+        raise ParameterError(f"{path}: BRIDGE's rewards are float32, and some of {mdp} are larger than 3.4e38")
     arrays: dict[str, Any] = {"transitions": np.asfortranarray(table), "rewards": rewards, **_screens(mdp, order)}
     with storage.replacing(path, follow=True) as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)

@@ -302,3 +302,11 @@ def test_the_check_of_an_agent_says_what_is_wrong(tmp_path, monkeypatch):
     assert done.exit_code == 1 and "mine.py has no 'nothing'" in done.stdout
     write_suite(Suite("x", PROTOCOL, (), (), "", {}), tmp_path / "x.yaml")
     assert json.loads(run("benchmark", "check", f"{file}:learn", "--json").stdout)["agent"] == f"{file}:learn"
+
+
+def test_a_loop_on_one_task_without_readings_is_diagnosed(tmp_path):
+    with benchmark.task("deep_sea-8", out=tmp_path / "mine", agent="mine") as env:
+        play(env, 10)
+        env.record(always(0))
+    done = run("diagnose", "--results", tmp_path / "mine")
+    assert done.exit_code == 0 and "Known faults are not compared" in done.output and "warning" not in done.output

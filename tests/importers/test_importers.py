@@ -543,6 +543,17 @@ def test_toy_text_keeps_the_names_of_its_documentation(tmp_path):
     assert rows[0]["variables"] == {"row": 3, "column": 0}
 
 
+def test_a_table_comes_back_from_json_and_large_rewards_do_not_fit_a_file_of_bridge(tmp_path):
+    mdp = pharos.build("frozen_lake/4x4").mdp()
+    table = json.loads(json.dumps(exporters.gym_p(mdp)))
+    assert importers.gymnasium(table, gamma=mdp.gamma).num_states == mdp.num_states
+    large = TabularMDP.from_arrays([[1], [1]], [[1e39], [0.0]])
+    assert "are larger than 3.4e38" in refusal(ParameterError, exporters.bridge, large, tmp_path / "x.npz")
+    importers.save(mdp.with_horizon(5), tmp_path / "five")
+    said = run("export", tmp_path / "five", "--format", "gym", "--out", tmp_path / "t.json").output
+    assert "5 steps: not in the file" in " ".join(said.split())
+
+
 def test_limits_hold_for_the_folder_of_an_imported_mdp_too(tmp_path):
     mdp = TabularMDP.from_arrays([[1], [2], [2]], [[1.0], [1.0], [0.0]])
     importers.save(mdp, tmp_path / "three")

@@ -387,6 +387,11 @@ def test_a_clock_is_named_and_left_out_on_demand():
     assert recording.notes == ()
 
 
+def test_a_start_that_is_drawn_from_a_range_is_imported_with_a_seed():
+    mdp, _ = importers.stepping(lambda: gymnasium.make("CartPole-v1"), seed=0, horizon=3)
+    assert mdp.num_states == 1 + 2 + 4
+
+
 def test_a_place_that_begins_at_0_is_no_clock():
     """A step against the wall stays at 0, though each new place is one step farther."""
     _, recording = importers.stepping(planted.Place)

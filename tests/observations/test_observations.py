@@ -129,12 +129,41 @@ def test_a_registered_function_is_known_by_its_name():
         (ball, spaces.Box(0, 1, (3,), np.float32), r"has shape \(1, 2\) for 1 states; expected \(1, 3\)"),
         (ball, spaces.Box(0, 255, (2,), np.uint8), r"has dtype float64; expected uint8.*astype"),
         (lambda env, states: states[:, :1] + 9.0, spaces.Box(0, 1, (1,)), "which is not in its space"),
+        (lambda env, states: np.zeros((len(states), 0)), spaces.Box(0, 1, (0,)), "has no entries"),
         (ball, spaces.Text(4), "expected a Box, Discrete"),
         (ball, "image", "expected a Box, Discrete"),
     ],
 )
 def test_a_users_function_that_does_not_keep_its_space_is_refused(function, space, message):
     assert re.search(message, refusal(ParameterError, observations.observe, pharos.make("breakout"), (function, space)))
+
+
+def test_a_users_function_may_write_to_what_it_gets():
+    def centred(env, states):
+        states -= 1
+        return states.astype(np.float32)
+
+    env = pharos.GymEnv("frozen_lake/4x4", observation=(centred, spaces.Box(-1, 10, (2,), np.float32)))
+    other = pharos.GymEnv("frozen_lake/4x4")
+    assert env.reset(seed=0)[1]["state"].tolist() == other.reset(seed=0)[1]["state"].tolist() == [0, 0]
+    for action in (1, 1, 2):
+        assert env.step(action)[4]["state"].tolist() == other.step(action)[4]["state"].tolist()
+
+
+@pytest.mark.parametrize(
+    ("function", "space", "message"),
+    [
+        (lambda env, s: np.where(s[:, :1] > 1, np.nan, 0.5), spaces.Box(0, 1, (1,)), "is array\\(\\[nan\\]"),
+        (lambda env, s: s.sum(1), spaces.Discrete(3), "expected one of its space Discrete"),
+        (lambda env, s: s.sum(1, keepdims=True), spaces.MultiBinary(1), "expected one of its space MultiBinary"),
+        (lambda env, s: s, spaces.MultiDiscrete([2, 2]), "expected one of its space MultiDiscrete"),
+    ],
+)
+def test_values_that_no_network_could_read_are_refused_in_whichever_state(function, space, message):
+    seen = observations.observe("frozen_lake/4x4", (function, space))
+    assert seen(np.array([[0, 1], [1, 0]])).shape[0] == 2
+    said = refusal(ParameterError, seen, np.array([[0, 0], [3, 3]]))
+    assert re.search(message, said) and "of the state (3, 3)" in said
 
 
 def test_unknown_names_and_options_suggest_the_nearest():

@@ -145,6 +145,11 @@ def test_a_mistake_is_told_with_its_line_and_the_nearest_name(line, wrong, expec
     assert expected in refusal(ParameterError, parse, "\n".join(lines) + "\n")
 
 
+def test_a_wrong_agent_is_told_alone():
+    said = refusal(ParameterError, parse, LAKES.replace("[dqn, ppo, q_learning]", "[dqm, ppo, q_learning]"))
+    assert "unknown agent 'dqm'; did you mean 'dqn'?" in said and "of this block" not in said
+
+
 @pytest.mark.parametrize("text", ["", "- a\n", "name: a\n", "blocks: []\nname: a\n", "a"])
 def test_what_is_no_study_is_refused(text):
     assert "specification" in refusal(ParameterError, parse, text)

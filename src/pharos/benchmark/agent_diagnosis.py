@@ -376,7 +376,7 @@ def diagnosis_of_results(contents: Contents) -> Diagnosis:
         for text in (*seeds_sentence([contents.agent]), *run_warnings(results))
         if "first policy came after" not in text
     ]
-    trusted = accuracy(kind or "dqn", SCORES, frozenset(numbers))
+    trusted = accuracy(kind or "dqn", SCORES, frozenset(numbers) or None)
     diagnosis = _diagnosis(
         contents.agent.name, kind, mistakes, answer, trusted, scores, numbers, from_results=True, lacks=lacks
     )

@@ -422,5 +422,7 @@ def export(
     else:
         storage.replace_file(out, json.dumps(exporters.gym_p(mdp)) + "\n", follow=True)
     answer = {"format": format, "file": out, "bytes": out.stat().st_size, "num_states": mdp.num_states}
+    horizon = None if mdp.horizon is None else f"{mdp.horizon} steps: not in the file, which has none"
     facts = [("format", format), ("states", f"{mdp.num_states:,}"), ("bytes", f"{answer['bytes']:,}")]
-    return Answer(answer, (str(out), facts))
+    facts += [("horizon", horizon)] if horizon else []
+    return Answer({**answer, "horizon": mdp.horizon}, (str(out), facts))

@@ -128,7 +128,7 @@ def _train_many(title: str, *, seeds: list[int], steps: int, out: Path | None, *
     }
     runs = [{"seed": seed, **run.result, "folder": run.folder} for seed, run in results.items()]
     answer = {"runs": runs, "failed": failed, "quartiles": spread, "seconds": seconds, "folder": out}
-    facts = _facts_of_many(results, spread, steps, seconds)
+    facts = _facts_of_many(results, spread, steps, seconds) if results else []
     notes: dict[str, dict[str, str]] = {}
     for number, run in results.items():
         for kind, text in run.notes.items():

@@ -210,7 +210,14 @@ def _rows(env: object) -> tuple[Any, list[list[list]]]:
     table = getattr(inner, "P", inner)
     if isinstance(table, str | bytes) or not isinstance(table, _Numbered):
         raise FileFormatError(f"{name_of(env)}: has no table P[s][a] of its transitions{_native(inner)}")
-    return inner, _listed(name_of(env), table)
+    return inner, _listed(name_of(env), _of_json(table))
+
+
+def _of_json(table: object) -> Any:
+    """The table with numbers in the place of texts among the keys, which JSON has."""
+    if not isinstance(table, Mapping) or not table or not all(isinstance(s, str) and s.isdecimal() for s in table):
+        return table
+    return {int(s): {int(a): row[a] for a in row} if isinstance(row, Mapping) else row for s, row in table.items()}
 
 
 @runtime_checkable

@@ -227,7 +227,7 @@ class SteppedEnvironment:
             is_over = False
             for _ in range(steps):
                 if is_over:
-                    self._reset(env)
+                    self._reset(env, self.options.seed)
                 is_over = self.step(env, rng.choice(self.actions))[2]
         finally:
             self.draws.sampler = None

@@ -88,8 +88,8 @@ class FunctionObservation(Observation):
     converted to the space's dtype if that keeps their kind (float64 to float32, integers to floats).
 
     Raises:
-        ParameterError: the result has another shape, or a dtype that does not fit. For the start states also if a value
-            lies outside the space.
+        ParameterError: the result has another shape, a dtype that does not fit, NaN, or a number that a space of
+            numbers lacks. For the start states also if a value lies outside a Box.
     """
 
     def __init__(self, env: Environment, function: Function, space: object, *, name: str | None = None):
@@ -104,6 +104,8 @@ class FunctionObservation(Observation):
                 f"observation {self.name!r}: its space is {one!r}; expected a Box, Discrete, MultiDiscrete or "
                 f"MultiBinary of Gymnasium, or a function that gives one for env"
             )
+        if 0 in (one.shape or ()):
+            raise ParameterError(f"observation {self.name!r}: its space {one} has no entries; expected at least one")
         self.space = one
         starts = np.array([state for state, _ in env.initial_states()], np.int64)
         for state, observation in zip(starts, self(starts), strict=True):
@@ -114,7 +116,7 @@ class FunctionObservation(Observation):
                 )
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
-        batch = np.asarray(self.function(self.env, states))
+        batch = np.asarray(self.function(self.env, states.copy()))  # functions may write to what they get
         expected = (len(states), *(self.space.shape or ()))
         if batch.shape != expected:
             raise ParameterError(
@@ -126,7 +128,28 @@ class FunctionObservation(Observation):
             raise ParameterError(
                 f"observation {self.name!r} has dtype {batch.dtype}; expected {dtype}, as its space says: use .astype"
             )
-        return np.array(batch, dtype)  # a copy: functions may return the same buffer twice
+        batch = np.array(batch, dtype)  # a copy: functions may return the same buffer twice
+        wrong = self._is_wrong(batch)
+        if wrong.any():
+            state = states[int(np.flatnonzero(wrong)[0])]
+            raise ParameterError(
+                f"observation {self.name!r} of the state {tuple(state.tolist())} is {batch[wrong][0]!r:.80}; expected "
+                f"{'numbers, no NaN' if dtype.kind == 'f' else f'one of its space {self.space}'}"
+            )
+        return batch
+
+    def _is_wrong(self, batch: np.ndarray) -> np.ndarray:
+        """(N,) bool, observations that no network could read: with NaN, or numbers that a space of numbers lacks."""
+        from gymnasium import spaces
+
+        rows = batch.reshape(len(batch), -1)
+        if isinstance(self.space, spaces.Box):
+            return np.isnan(rows).any(axis=1) if batch.dtype.kind == "f" else np.zeros(len(batch), np.bool_)
+        first, number = np.zeros(1, np.int64), np.full(1, 2)  # of MultiBinary
+        if isinstance(self.space, spaces.Discrete | spaces.MultiDiscrete):
+            numbers = self.space.n if isinstance(self.space, spaces.Discrete) else self.space.nvec
+            first, number = np.ravel(self.space.start), np.ravel(numbers)
+        return np.asarray(((rows < first) | (rows >= first + number)).any(axis=1))
 
 
 # Name of one of pharos' own -> its file and class, which is loaded when it is first asked for

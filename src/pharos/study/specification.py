@@ -321,11 +321,11 @@ def _wrong(specification: Specification) -> Iterator[tuple[Loc, str]]:
         # Hyperparameters
         for agent, own in block.hyperparameters.items():
             loc = ("blocks", i, "hyperparameters", agent)
-            if agent not in block.agents:
+            if agent not in block.agents and all(map(_is_agent, block.agents)):
                 yield loc, str(UnknownName("agent of this block", agent, block.agents))
             elif isinstance(own, str) and own not in specification.hyperparameters:
                 yield loc, str(UnknownName("set of hyperparameters", own, specification.hyperparameters))
-            else:
+            elif _is_agent(agent):
                 values = specification.hyperparameters[own] if isinstance(own, str) else own
                 try:
                     agent_called(agent).check_before(values, specification.engine_of(block, agent))

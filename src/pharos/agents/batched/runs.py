@@ -109,7 +109,9 @@ class ObservationSource:
         box = observe.space
         self.shape, self.dtype = tuple(box.shape or ()), np.dtype(box.dtype)  # type: ignore[arg-type]
         if not self.shape:
-            raise ParameterError("the batched engine has no network for the number of the state; expected 'vector'")
+            raise ParameterError(
+                "the batched engine has no network for the number of the state; the engine sb3 has one"
+            )
         self.is_image = False
         if len(self.shape) == 3 and self.dtype == np.uint8:
             low, high = np.asarray(getattr(box, "low", 1)), np.asarray(getattr(box, "high", 1))
