@@ -242,7 +242,7 @@ class Agent:
         """Raise ParameterError or UnknownName for hyperparameters that the agent lacks, or whose values are wrong."""
 
     def check_before(self, hyperparameters: Mapping[str, Any], engine: str) -> None:
-        """As `check`, before anything runs: no library is imported for names that are known, or has to be there."""
+        """Check before anything runs: no library is imported for names that are known, or has to be there."""
         self.check(hyperparameters, engine)
 
     def group_key(self, run: PlannedRun, device: str) -> Hashable | None:
