@@ -309,4 +309,5 @@ def test_a_loop_on_one_task_without_readings_is_diagnosed(tmp_path):
         play(env, 10)
         env.record(always(0))
     done = run("diagnose", "--results", tmp_path / "mine")
-    assert done.exit_code == 0 and "Known faults are not compared" in done.output and "warning" not in done.output
+    assert done.exit_code == 0 and "warning" not in done.output
+    assert "Known faults are not compared" in done.output and "run your loop on these tasks" in done.output

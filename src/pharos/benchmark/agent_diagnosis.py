@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from pharos.agents import agents
 from pharos.benchmark.comparison import LEAST_DIFFERENCE, WORSE, compare_groups
 from pharos.benchmark.contents import (
     MOST_RECORD_LETTERS,
@@ -63,6 +64,7 @@ from pharos.benchmark.profiles import (
 from pharos.benchmark.scores import run_scores
 from pharos.benchmark.suite import Suite, load_suite
 from pharos.errors import ParameterError
+from pharos.system.sources import is_reference
 from pharos.system.wording import pluralize
 
 EXPLORER = (
@@ -419,10 +421,10 @@ def missing_tasks(contents: Contents) -> str:
     more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
     source = results.record.get("source")
     agent = source["name"] if isinstance(source, Mapping) and isinstance(source.get("name"), str) else results.agent
-    return (
-        f"Known faults are not compared: the run lacks {missing[0]}{more} of the suite v1; `pharos diagnose {agent}` "
-        f"compares them, in some minutes."
-    )
+    remedy = f"`pharos diagnose {agent}` compares them, in some minutes"
+    if agent not in agents() and not is_reference(agent):  # a loop of the user's own
+        remedy = "run your loop on these tasks, too: " + ", ".join(missing)
+    return f"Known faults are not compared: the run lacks {missing[0]}{more} of the suite v1; {remedy}."
 
 
 def findings_of(contents: Contents) -> list[Finding]:
