@@ -32,8 +32,9 @@ if TYPE_CHECKING:
 
 OUR_FILES = (*ARRAYS, *PART_NAMES.values(), SHARDS, MANIFEST + ".tmp", storage.LOCK, storage.CLAIM)
 BUILD_CHECKPOINT_SECONDS = 15.0
-LOOKED_AT = 100
-"""States of a class of the user's own that are looked at, interpreted, before its state space is built."""
+LOOKED_AT = 100, 5000
+"""States, and outcomes of actions in them, of a class of the user's own that are looked at before its space is built:
+interpreted, a tenth of a second."""
 Hold = Callable[[Path], contextlib.AbstractContextManager[object]]  # of a folder, for one builder
 
 
@@ -152,7 +153,7 @@ def _look_at(env: Environment) -> None:
         raise RuleError(f"{env}: max_episode_steps is {steps!r}; expected an integer of at least 1")
     if not env.num_actions:
         raise RuleError(f"{env}: actions is {env.actions!r}; expected a tuple of different names, at least one")
-    FirstLook(env).states(LOOKED_AT)
+    FirstLook(env).states(*LOOKED_AT)
 
 
 def _waiting(path: Path) -> contextlib.ExitStack:

@@ -287,11 +287,11 @@ class FirstLook(InterpretedCheck):
     Truth may be a number here, and integers may be floats without a fraction, as compiled rules take both.
     """
 
-    def states(self, most: int) -> None:
-        """Look at the states nearest to the start. RuleError: the first breach."""
+    def states(self, most: int, most_branches: int) -> None:
+        """Look at so many states near the start, fewer if these have many outcomes. RuleError: the first breach."""
         queue = deque(start_distribution(self.env)[0])
-        states = set(queue)
-        while queue and len(self.terminal) < most:
+        states, branches = set(queue), self.env.num_actions * int(self.env.outcomes)
+        while queue and len(self.terminal) < min(most, most_branches // branches):
             try:
                 successors = self.expand(queue.popleft())
             except (_NotLooked, OverflowError):
