@@ -83,7 +83,10 @@ def has_screens(path: str | os.PathLike) -> bool:
 
 
 def how_to_import(path: Path) -> str:
-    """The command that brings a file into a folder; or which files can be."""
+    """The command that brings a file into a folder; or which files can be. FileFormatError: it is code."""
+    if path.suffix == ".py":
+        classes = re.findall(r"^class (\w+)", path.read_text(encoding="utf-8", errors="replace"), re.MULTILINE)
+        raise FileFormatError(f"{path} is code; name a class in it, such as {path}:{(classes or ['MyClass'])[0]}")
     kind = "prism" if path.suffix in SUFFIXES else "bridge" if path.suffix == ".npz" else ""
     if kind:
         return f"`pharos import {kind} {path} --out FOLDER`"
@@ -96,9 +99,6 @@ def how_to_import(path: Path) -> str:
 def _members(path: Path, names: tuple[str, ...]) -> dict[str, np.ndarray]:
     try:
         storage.check_regular(path)
-        if path.suffix == ".py" and path.exists():
-            classes = re.findall(r"^class (\w+)", path.read_text(encoding="utf-8", errors="replace"), re.MULTILINE)
-            raise FileFormatError(f"{path} is code; name a class in it, such as {path}:{(classes or ['MyClass'])[0]}")
         if path.exists() and not zipfile.is_zipfile(path):
             advice = "" if path.suffix == ".npz" else f"; {how_to_import(path)}"
             raise FileFormatError(f"{path}: cannot be read as npz: it is no zip archive{advice}")
