@@ -161,7 +161,7 @@ def test_a_users_function_may_write_to_what_it_gets():
 )
 def test_values_that_no_network_could_read_are_refused_in_whichever_state(function, space, message):
     seen = observations.observe("frozen_lake/4x4", (function, space))
-    assert seen(np.array([[0, 1], [1, 0]])).shape[0] == 2
+    assert seen(np.array([[0, 1], [1, 0]])).shape[0] == 2 and len(seen(np.empty((0, 2), np.int64))) == 0
     said = refusal(ParameterError, seen, np.array([[0, 0], [3, 3]]))
     assert re.search(message, said) and "of the state (3, 3)" in said
 

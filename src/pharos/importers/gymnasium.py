@@ -215,9 +215,9 @@ def _rows(env: object) -> tuple[Any, list[list[list]]]:
 
 def _of_json(table: object) -> Any:
     """The table with numbers in the place of texts among the keys, which JSON has."""
-    if not isinstance(table, Mapping) or not table or not all(isinstance(s, str) and s.isdecimal() for s in table):
+    if not isinstance(table, Mapping) or not all(isinstance(key, str) and key.isdecimal() for key in table):
         return table
-    return {int(s): {int(a): row[a] for a in row} if isinstance(row, Mapping) else row for s, row in table.items()}
+    return {int(key): _of_json(row) for key, row in table.items()}
 
 
 @runtime_checkable

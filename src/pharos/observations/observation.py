@@ -142,7 +142,7 @@ class FunctionObservation(Observation):
         """(N,) bool, observations that no network could read: with NaN, or numbers that a space of numbers lacks."""
         from gymnasium import spaces
 
-        rows = batch.reshape(len(batch), -1)
+        rows = batch.reshape(len(batch), int(np.prod(batch.shape[1:])))
         if isinstance(self.space, spaces.Box):
             return np.isnan(rows).any(axis=1) if batch.dtype.kind == "f" else np.zeros(len(batch), np.bool_)
         first, number = np.zeros(1, np.int64), np.full(1, 2)  # of MultiBinary
