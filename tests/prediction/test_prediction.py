@@ -157,6 +157,8 @@ def test_hyperparameters_that_the_agent_lacks_are_refused_and_those_without_effe
         pharos.predict("river_swim", length=5, hyperparameters={"learning_rat": 0.1})
     said = pharos.predict("river_swim", length=5, steps=1500, hyperparameters={"tau": 0.5}).warnings
     assert any(line.startswith("tau: no part of the idealised learner") for line in said)
+    coins = pharos.predict("river_swim", ["vector", ("vector", {"irrelevant": 2})], length=5, steps=1500).warnings
+    assert sum("irrelevant entries are 0 in kernels" in line for line in coins) == 1
 
 
 def test_a_unit_outside_of_what_was_tested_is_named():

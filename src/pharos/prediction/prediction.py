@@ -257,6 +257,8 @@ def predict(
     width, cells, states, spread = covering.half_width(), [], 0, math.nan
     # A cell for each observation and network
     for name, view in _observations(observations):
+        if view.get("irrelevant") and COINS not in unused:
+            unused.append(COINS)
         task = Task.of(env, chance=chance, observation=name, observation_options=view, horizon=training.horizon)
         states = _checked_states(task.space.num_states, env)
         settings = hyperparameters_of(agent, env.name, str(task.observation), overrides)
@@ -407,6 +409,9 @@ def _stand_ins(agent: str, cells: Iterable[PredictedRegret]) -> Iterable[str]:
             f"{labels}: predicted by {measure}, as {predictor} is for at most 4,096 different observations without "
             "landmarks, and networks whose output layer is known; the interval is not calibrated here"
         )
+
+
+COINS = "irrelevant entries are 0 in kernels, so what they do to an agent is not predicted"
 
 
 def _unused_hyperparameters(agent: str, overrides: Mapping[str, Any]) -> list[str]:
