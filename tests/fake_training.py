@@ -23,12 +23,12 @@ SLOWNESS = {"vector": 1.0, "simple_image": 1.7, "index": 0.5}
 
 
 def train(config, folder):
-    """Write run.json and curve.parquet; fails where the hyperparameter `fail` says so."""
+    """Write run.json and curve.parquet; fails if the hyperparameter `target_update_interval` is the seed."""
     time.sleep(float(os.environ.get("PHAROS_FAKE_SECONDS", "0")))
     while (limit := os.environ.get("PHAROS_FAKE_LIMIT")) and number_of_lines() >= int(limit):
         time.sleep(0.01)
     hyperparameters = config["hyperparameters"]
-    if hyperparameters.get("fail") == "always" or config["seed"] == hyperparameters.get("fail_seed"):
+    if config["seed"] == hyperparameters.get("target_update_interval"):
         raise ValueError("this seed\nfails on purpose")
     id = run_id(config)
     rng = np.random.default_rng(int(id, 16))

@@ -76,7 +76,7 @@ def test_the_folder_of_a_study_is_a_specification_of_the_same_runs(tmp_path):
 
 
 def test_a_run_that_fails_fails_alone_says_why_and_is_repeated_only_on_request(tmp_path, log):
-    spec = specification(agents=["dqn"], hyperparameters={"dqn": {"fail_seed": 1}})
+    spec = specification(agents=["dqn"], hyperparameters={"dqn": {"target_update_interval": 1}})
     end = study.run(spec, tmp_path / "out", runner=fake_training.train, workers=2)
     assert (end.finished, end.failed) == (2, 1)
     (failed,) = end.errors
