@@ -547,6 +547,8 @@ def test_a_table_comes_back_from_json_and_large_rewards_do_not_fit_a_file_of_bri
     mdp = pharos.build("frozen_lake/4x4").mdp()
     table = json.loads(json.dumps(exporters.gym_p(mdp)))
     assert importers.gymnasium(table, gamma=mdp.gamma).num_states == mdp.num_states
+    twice = {**table, "00": table["0"]}  # of which one would be lost
+    assert "has no P[0]" in refusal(FileFormatError, importers.gymnasium, twice)
     large = TabularMDP.from_arrays([[1], [1]], [[1e39], [0.0]])
     assert "are larger than 3.4e38" in refusal(ParameterError, exporters.bridge, large, tmp_path / "x.npz")
     importers.save(mdp.with_horizon(5), tmp_path / "five")

@@ -9,7 +9,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -299,11 +299,13 @@ class Target:
             return build(self.found_environment(), out, **options)
         assert self.path is not None
         space = load(self.path, verify=launched()[0] == 0)  # of ranks, the first reads it all
-        if options["max_states"] is not None and space.num_states > options["max_states"]:
-            raise ParameterError(
-                f"{self.path}: has {space.num_states} states; expected at most {options['max_states']}"
-            )
+        self._check_size(space.num_states, options)
         return space
+
+    def _check_size(self, num_states: int, options: Mapping[str, Any]) -> None:
+        """ParameterError if the folder of the target has more states than the options allow."""
+        if options["max_states"] is not None and num_states > options["max_states"]:
+            raise ParameterError(f"{self.path}: has {num_states} states; expected at most {options['max_states']}")
 
     def mdp(
         self,
@@ -320,9 +322,8 @@ class Target:
         """
         chance = chance or ChanceSetting()
         if self.is_imported:
-            mdp, most = self._imported(horizon), (building or Building()).options["max_states"]
-            if most is not None and mdp.num_states > most:
-                raise ParameterError(f"{self.path}: has {mdp.num_states} states; expected at most {most}")
+            mdp = self._imported(horizon)
+            self._check_size(mdp.num_states, (building or Building()).options)
             return chance.of(mdp if gamma is None else mdp.with_gamma(gamma))
         space = self.rewarded_space(building)
         by_range = by_range or (building is not None and building.ranks == "mpi")

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pharos.errors import ParameterError, PrecisionError
-from pharos.hardness.interval import Certified, fields_of
+from pharos.hardness.interval import EXACT_WIDTH, Certified, fields_of
 from pharos.kernels import gaps as kernels
 from pharos.mdp import (
     BEST,
@@ -292,8 +292,6 @@ class UnresolvedTies:
 
 # Of Colosseum.
 REGULARIZER = 0.1
-# Relative width up to which an interval counts as the value.
-VALUE_WIDTH = 1e-6
 # The default tie tolerance is this times the error bound of the values; more than 2, as a gap is known to twice the
 # bound.
 ERRORS_PER_TIE = 2.5
@@ -344,7 +342,7 @@ class Gaps:
     @property
     def is_resolved(self) -> bool:
         """Whether ties are ties, and the sum is known to a relative 1e-6."""
-        return not self.unresolved and self.upper - self.lower <= VALUE_WIDTH * self.upper
+        return not self.unresolved and self.upper - self.lower <= EXACT_WIDTH * self.upper
 
     @property
     def certified_sum(self) -> Certified:
@@ -363,10 +361,10 @@ class Gaps:
         share = self.error / REGULARIZER
         high = self.regularized / (1 - share) * (1 + _ROUNDING) if share < 1 else math.inf
         low = self.regularized / (1 + share) * (1 - _ROUNDING)
-        return Certified(self.regularized, low, high, high - low <= VALUE_WIDTH * high)
+        return Certified(self.regularized, low, high, high - low <= EXACT_WIDTH * high)
 
     def _certified(self, value: float, lower: float, upper: float) -> Certified:
-        exact = not self.unresolved and (lower == upper or upper - lower <= VALUE_WIDTH * upper)
+        exact = not self.unresolved and (lower == upper or upper - lower <= EXACT_WIDTH * upper)
         note = ""
         if self.unresolved:
             note = (

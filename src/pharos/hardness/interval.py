@@ -159,7 +159,7 @@ def certificate_of(outcome: object) -> Certificate:
         slack = 1e-9 * max(abs(lower), abs(upper)) if math.isfinite(upper - lower) else 0.0
         if outcome.value < lower - slack or outcome.value > upper + slack:
             raise ParameterError(f"a measure is {outcome.value}, outside of its interval [{lower}, {upper}]")
-        if outcome.exact and lower != upper and not upper - lower <= 2 * EXACT_WIDTH * max(abs(lower), abs(upper)):
+        if outcome.exact and lower != upper and not upper - lower <= EXACT_WIDTH * max(abs(lower), abs(upper)):
             raise ParameterError(
                 f"a measure calls the interval [{lower}, {upper}] exact; expected {EXACT_WIDTH:g} of it"
             )

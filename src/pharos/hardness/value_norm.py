@@ -12,7 +12,7 @@ import numpy as np
 
 from pharos.errors import ParameterError
 from pharos.hardness.gaps import gaps_of_states, optimal_solution
-from pharos.hardness.interval import Certified
+from pharos.hardness.interval import EXACT_WIDTH, Certified
 from pharos.mdp import (
     Chance,
     TabularMDP,
@@ -25,8 +25,6 @@ from pharos.system.arrays import UNIT_ROUNDOFF
 
 # States at once: values of all their outcomes are in memory.
 _VARIANCE_BLOCK = 1 << 16
-# Relative width up to which an interval counts as the value.
-_NARROW = 1e-6
 
 
 @require_mdp
@@ -82,7 +80,7 @@ def certified_value_norm(
     value = math.sqrt(largest) * scale
     error = solution.error_bound + (3 * mdp.num_actions + mdp.dynamics.operations + 16) * UNIT_ROUNDOFF * size
     lower, upper = max(0.0, value - error), value + error
-    return Certified(value, lower, upper, upper - lower <= _NARROW * upper or upper == 0.0)
+    return Certified(value, lower, upper, upper - lower <= EXACT_WIDTH * upper or upper == 0.0)
 
 
 def _moments(mdp: TabularMDP, x: np.ndarray, states: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:

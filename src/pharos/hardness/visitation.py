@@ -22,7 +22,7 @@ import scipy  # whose `sparse` is loaded on first use
 
 from pharos.errors import ParameterError, UndefinedMeasure
 from pharos.hardness.gaps import optimal_solution
-from pharos.hardness.interval import Interval, fields_of, finite
+from pharos.hardness.interval import EXACT_WIDTH, Interval, fields_of, finite
 from pharos.hardness.steps import steps_of
 from pharos.kernels import occupancy as kernels
 from pharos.mdp import (
@@ -750,8 +750,8 @@ def distribution_mismatch(
     return Interval(
         lower,
         upper,
-        exact=math.isfinite(upper) and upper - lower <= 1e-6 * upper,
-        tolerance=1e-6,
+        exact=math.isfinite(upper) and upper - lower <= EXACT_WIDTH * upper,
+        tolerance=EXACT_WIDTH,
         method="occupancy measures",
         conventions={"gamma": mdp.gamma, "policy": "uniform" if policy is None else "given"},
         note="" if math.isfinite(upper) else "the policy hardly ever reaches a state of the optimal policy",

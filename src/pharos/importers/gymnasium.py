@@ -9,6 +9,7 @@ import io
 import itertools
 import operator
 import pickle  # noqa: TID251  (to copy an environment of the caller)
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -213,9 +214,12 @@ def _rows(env: object) -> tuple[Any, list[list[list]]]:
     return inner, _listed(name_of(env), _of_json(table))
 
 
+_NUMBER = re.compile("0|[1-9][0-9]{0,17}")  # written in one way only, so that no two keys are one
+
+
 def _of_json(table: object) -> Any:
     """The table with numbers in the place of texts among the keys, which JSON has."""
-    if not isinstance(table, Mapping) or not all(isinstance(key, str) and key.isdecimal() for key in table):
+    if not isinstance(table, Mapping) or not all(isinstance(key, str) and _NUMBER.fullmatch(key) for key in table):
         return table
     return {int(key): _of_json(row) for key, row in table.items()}
 

@@ -256,9 +256,8 @@ def predict(
     overrides = {**(COMMON[agent] if common else {}), **(training.hyperparameters or {})}
     width, cells, states, spread = covering.half_width(), [], 0, math.nan
     # A cell for each observation and network
-    for name, view in _observations(observations):
-        if view.get("irrelevant") and COINS not in unused:
-            unused.append(COINS)
+    views = [*_observations(observations)]
+    for name, view in views:
         task = Task.of(env, chance=chance, observation=name, observation_options=view, horizon=training.horizon)
         states = _checked_states(task.space.num_states, env)
         settings = hyperparameters_of(agent, env.name, str(task.observation), overrides)
@@ -306,6 +305,7 @@ def predict(
             *_stand_ins(agent, cells),
             *_other_hyperparameters(agent, settings),
             *unused,
+            *[COINS] * any(view.get("irrelevant") for _, view in views),
         ),
         hyperparameters=settings,
     )

@@ -329,11 +329,14 @@ class FirstLook(InterpretedCheck):
         return super()._checked(where, whole)
 
     def _reward(self, state: State, action: int, successor: State, outcome: int) -> float:
-        which = (outcome,) if self.env.pays_by_outcome() else ()
-        reward = self._call("", self.env.reward, _ReadOnly(state), action, _ReadOnly(successor), *which)
-        if isinstance(reward, numbers.Real) and not math.isfinite(reward):
-            raise _NotLooked
-        return super()._reward(state, action, successor, outcome)
+        try:
+            return super()._reward(state, action, successor, outcome)
+        except RuleError:
+            which = (outcome,) if self.env.pays_by_outcome() else ()
+            reward = self._call("", self.env.reward, _ReadOnly(state), action, _ReadOnly(successor), *which)
+            if isinstance(reward, numbers.Real) and not math.isfinite(reward):
+                raise _NotLooked from None
+            raise
 
     def _call(self, where: str, rule: Callable, *arguments) -> object:
         try:

@@ -97,7 +97,7 @@ def train_many(
     """
     if not isinstance(seeds, Iterable):
         raise ParameterError(f"seeds is {seeds!r}; expected several, such as range(3)")
-    numbers = [whole_number(seed, "seed", "a whole number, at least 0", least=0) for seed in seeds]
+    numbers = list(seeds)
     if not numbers or len(set(numbers)) != len(numbers):
         raise ParameterError(f"seeds are {numbers}; expected at least one, each once")
     name = agent_name(agent)
@@ -179,8 +179,7 @@ def _runs(
     """The task, and the configuration of a run with each of the seeds. `options` are the same as for `train`."""
     training, parameters = split_options(TrainingOptions, options)
     agent, hyperparameters, table = training.agent, training.hyperparameters, options.get("hyperparameters")
-    for seed in seeds:
-        whole_number(seed, "seed", "a whole number, at least 0", least=0)
+    seeds = [whole_number(seed, "seed", "a whole number, at least 0", least=0) for seed in seeds]
     name = agent_called(agent).observation(training.observation)
     if training.observation_options and agent_called(agent).fixed_observation is not None:
         raise ParameterError(
