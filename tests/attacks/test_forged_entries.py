@@ -211,6 +211,9 @@ def settings(content: Content) -> Iterator[Forgery]:
             {"reward_noise": 1e300},
             {"reward_delay": 10**18},
             {"reward_delay": HUGE},
+            *({"scale_rewards": unit} for unit in ("range", "Range", "range" * 1000, 0.0, -1, 1e-300, HUGE, True)),
+            {"scale_rewards": "range", "random": 1.0},
+            {"sticky": "range"},
             {"luck": 1.0},
         ),
         "parameters": (
