@@ -79,13 +79,13 @@ def test_wrong_usage_is_one_line_and_exit_code_2(folder, arguments, message):
 
 @pytest.mark.long
 def test_a_study_with_failed_runs_ends_with_exit_code_1_and_says_where_to_look(folder):
-    wrong = "[q_learning]\n    hyperparameters: {q_learning: {learning_rat: 0.5}}"
-    text = SPECIFICATION.replace("name: lake", "name: wrong").replace("[q_learning]", wrong)
+    (folder / "broken.py").write_text("def learn(env, steps, seed):\n    raise ValueError('on purpose')\n    yield\n")
+    text = SPECIFICATION.replace("name: lake", "name: wrong").replace("q_learning", "broken.py:learn")
     (folder / "wrong.yaml").write_text(text)
     done = pharos("run", "wrong.yaml", cwd=folder)
     assert done.returncode == 1
     assert done.stdout == "wrong: 0 of 2 runs finished, 2 failed\n"
-    assert "2 x " in done.stderr and "learning_rat" in done.stderr and "--retry-failed" in done.stderr
+    assert "2 x agent broken.py:learn raised ValueError: on purpose" in done.stderr and "--retry-failed" in done.stderr
 
 
 @pytest.mark.long

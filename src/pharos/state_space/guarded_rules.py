@@ -5,7 +5,7 @@ import numbers
 import operator
 from collections import deque
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from pharos.environments import Environment, Layer, State, start_distribution
 from pharos.errors import RuleError
 from pharos.system.arrays import SUM_TOLERANCE
 
+Answer = TypeVar("Answer")
 SAME_ANSWER = "expected the same answer to the same question"
 
 
@@ -255,7 +256,7 @@ class InterpretedCheck:
             raise RuleError(f"{where} is {answers[0]}, then {answers[1]}; {SAME_ANSWER}")
         return float(answers[0])
 
-    def _call(self, where: str, rule: Callable, *arguments) -> Any:
+    def _call(self, where: str, rule: Callable[..., Answer], *arguments) -> Answer:
         try:
             return rule(*arguments)
         except _StateWritten:
@@ -338,7 +339,7 @@ class FirstLook(InterpretedCheck):
                 raise _NotLooked from None
             raise
 
-    def _call(self, where: str, rule: Callable, *arguments) -> object:
+    def _call(self, where: str, rule: Callable[..., Answer], *arguments) -> Answer:
         try:
             return rule(*arguments)
         except Exception as error:
