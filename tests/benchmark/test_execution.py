@@ -1,6 +1,7 @@
 """Runs of agents on a small suite: forms, budget, misuse, and folders that go on."""
 
 import json
+import math
 import random
 import signal
 import subprocess
@@ -8,6 +9,7 @@ import sys
 import threading
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +24,7 @@ from pharos.benchmark.suite import EARLIER, digest_of_suite, frozen
 from pharos.errors import AllRunsFailed, ParameterError, UnknownName
 from pharos.system.sources import find_source, load_source
 from pharos.training import generated_curve, write_curve
+from refusals import refusal
 
 PROTOCOL = Protocol(steps=300, evaluations=3, seeds=2)
 SEA = {"size": 4, "mapping_seed": 1}
@@ -329,6 +332,13 @@ def test_what_is_no_generator_is_refused(suite, tmp_path):
         benchmark.run(lambda env: None, suite, out=tmp_path)
     with pytest.raises(AllRunsFailed, match="expected a generator"):
         benchmark.run(lambda env, steps, seed: None, suite, out=tmp_path, seeds=[0])
+
+
+@pytest.mark.parametrize("timeout", [-1, 0, math.nan, True, "60"])
+def test_a_timeout_that_is_no_time_is_refused_before_anything_runs(timeout, suite, tmp_path):
+    for call in (partial(benchmark.run, suite=suite, out=tmp_path / "out"), benchmark.check_agent, benchmark.diagnose):
+        assert "expected a number of seconds above 0" in refusal(ParameterError, call, "q_learning", timeout=timeout)
+    assert not (tmp_path / "out").exists()
 
 
 # Folders --------------------------------------------------------------------------------------------------------------

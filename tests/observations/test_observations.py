@@ -100,6 +100,11 @@ def test_every_observation_keeps_its_space_and_sees_each_state_alone(name, tmp_p
         expected = batch.copy()
         batch[...] = 1 - batch
         assert (observation(states) == expected).all(), "a batch is a fresh array: whoever gets it may write to it"
+        for wrong in (states + 1000, states - 1000, states.astype(np.float64), states[:, 1:], states[0]):
+            assert str(env) in refusal(ParameterError, observation, wrong), (
+                "compiled code would read or write elsewhere"
+            )
+        assert str(env) in refusal(ParameterError, observation.one, states[0] + 1000)
     assert num_worlds, f"no world of this test has {name}: add one to `worlds`"
 
 

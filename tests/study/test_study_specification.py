@@ -27,7 +27,7 @@ hyperparameters:
 blocks:
   - environments: [frozen_lake/4x4, {name: frozen_lake, parameters: {size: 6, seed: 1}}]
     chance: [plain, {sticky: 0.25}, {random: 0.1}]
-    observations: [vector, {name: simple_image, options: {channels: first}}]
+    observations: [vector, {name: simple_image, options: {grey: true}}]
     agents: [dqn, ppo, q_learning]
     hyperparameters: {dqn: patient, ppo: {n_steps: 256}}
 """
@@ -127,6 +127,7 @@ def test_defaults_of_a_study_go_before_those_of_the_library_and_below_those_of_a
         (9, "    chance: [plian]", "specification:9: unknown chance 'plian'; did you mean 'plain'?"),
         (9, "    chance: [{random: 1.5}]", "specification:9: ChanceSetting: random=1.5; expected a finite number"),
         (10, "    observations: [vectr]", "specification:10: unknown observation 'vectr'; did you mean 'vector'?"),
+        (10, "    observations: [{name: simple_image, options: {gray: true}}]", "specification:10: unknown option of observation 'simple_image' 'gray'; did you mean 'grey'?"),  # noqa: E501
         (11, "    agents: [dqn, ppo, qlearning]", "specification:11: unknown agent 'qlearning'; did you mean 'q_learning'?"),  # noqa: E501
         (11, "    agents: []", "specification:11: agents: found []"),
         (12, "    hyperparameters: {dqn: patent}", "specification:12: unknown set of hyperparameters 'patent'; did you mean 'patient'?"),  # noqa: E501

@@ -9,6 +9,7 @@ from typing import Any
 from pharos.benchmark.execution import Outcome, run
 from pharos.benchmark.suite import BenchmarkTask, Protocol, Suite, digest_of_suite, frozen
 from pharos.errors import AllRunsFailed, ParameterError
+from pharos.system.workers import check_timeout
 
 CHECK_PROTOCOL = Protocol(steps=6000, evaluations=3, seeds=2)
 TASKS = (
@@ -64,6 +65,7 @@ def check_agent(
     Returns:
         An AgentCheck, which is true if there was no error. Print it.
     """
+    check_timeout(timeout)
     label = agent if isinstance(agent, str) else getattr(agent, "__qualname__", repr(agent))
     suite = Suite("check", CHECK_PROTOCOL, tuple(frozen(task, CHECK_PROTOCOL) for task in TASKS), ())
     suite = replace(suite, digest=digest_of_suite(suite))

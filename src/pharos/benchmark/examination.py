@@ -30,7 +30,7 @@ from pharos.errors import ParameterError, TimeLimit, UnknownName
 from pharos.policies import PolicyLike, SB3Model
 from pharos.system.interrupts import time_limit
 from pharos.system.sources import find_source, load_source
-from pharos.system.workers import Terminated
+from pharos.system.workers import Terminated, check_timeout
 from pharos.training import (
     BudgetSpent,
     CountedEnv,
@@ -394,6 +394,7 @@ def examine(
         PharosError: its code raises something, SystemExit included. TimeLimit: a run took longer than was allowed.
     Cost: `len(worlds) * len(seeds)` runs, and values of some hundred states.
     """
+    check_timeout(timeout)
     has_table = isinstance(agent, str) and agent in agents() and agents()[agent].has_table
     learn, file = (None, None) if has_table else (learner_of(agent, hyperparameters), _file_of(agent))
     setting = {**agents()[str(agent)].defaults, **(hyperparameters or {})} if has_table else {}

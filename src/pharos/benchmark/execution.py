@@ -27,7 +27,7 @@ from pharos.benchmark.suite import CORE, EARLIER, BenchmarkTask, Suite, load_sui
 from pharos.errors import AllRunsFailed, FolderLocked, ParameterError, PharosError, UnknownName
 from pharos.system import storage
 from pharos.system.wording import in_one_line, pluralize
-from pharos.system.workers import usable_workers
+from pharos.system.workers import check_timeout, usable_workers
 from pharos.training import versions
 
 SUITE, AGENT, SCORE = "suite.json", "agent.json", "score.json"
@@ -110,6 +110,7 @@ def run(  # noqa: PLR0913
             agent, setting or suite. AllRunsFailed: no run has finished. FolderLocked: another process is at it.
     Cost: 30,000 steps a task and seed for v1, 600,000 for large.
     """
+    check_timeout(timeout)
     folder = Path(out).absolute()  # an agent may change the directory when its file is loaded
     suite = suite if isinstance(suite, Suite) else load_suite(suite)
     form = agent_form(agent, suite, hyperparameters)

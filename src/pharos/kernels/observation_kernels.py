@@ -14,6 +14,16 @@ from pharos.kernels.kernel_cache import kernel
 
 
 @kernel
+def first_beyond_ranges(states, low, size):
+    """The first n with a component of states (N, D) outside of low[i] .. low[i] + size[i] - 1, or -1."""
+    for n in range(states.shape[0]):
+        for i in range(states.shape[1]):
+            if states[n, i] < low[i] or states[n, i] >= low[i] + size[i]:
+                return n
+    return -1
+
+
+@kernel
 def normalize(states, low, scale, out):
     """out[n, i] = (states[n, i] - low[i]) * scale[i] for the first D columns of out (N, D or more) float32."""
     for n in range(states.shape[0]):

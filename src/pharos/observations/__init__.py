@@ -10,6 +10,7 @@ from pharos.observations.context import NO_ACTION, ObservationInContext, Seen
 from pharos.observations.observation import (
     FunctionObservation,
     Observation,
+    check_options,
     names,
     observe,
     register,

@@ -217,6 +217,7 @@ class SimpleImage(Frames):
         self.is_flat = scale == 1 and not grey and not self._drawing.motion and frames == 1
 
     def frame(self, states: np.ndarray) -> np.ndarray:
+        states = self.checked(states)
         out = np.zeros((len(states), *self._one[1:]), np.uint8)
         self._drawing(states, out, self.shades, self._covering)
         return out
@@ -225,7 +226,7 @@ class SimpleImage(Frames):
         if self.frames > 1:
             return self(state[None])[0]
         out = np.zeros(self._one, np.uint8)
-        self._drawing.one(state, out, self.shades, self._covering)
+        self._drawing.one(self.checked(state[None])[0], out, self.shades, self._covering)
         return out[0]
 
 
@@ -318,6 +319,7 @@ class ComplexImage(Frames):
         self._stack(frames, 0 if channels_first else 2)
 
     def frame(self, states: np.ndarray) -> np.ndarray:
+        states = self.checked(states)
         out = np.empty((len(states), *self._tables[0].shape), np.uint8)
         self._drawing(states, out, *self._tables)
         return np.ascontiguousarray(out.transpose(0, 3, 1, 2)) if self._channels_first else out

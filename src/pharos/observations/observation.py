@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 
+from pharos.drawing import check_state
 from pharos.environments import Environment, make
 from pharos.errors import ParameterError, UnknownName
 from pharos.system import sources
@@ -56,8 +57,28 @@ class Observation:
     shades: np.ndarray
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
-        """(N, D) int64 states -> (N, *space.shape) of space.dtype, a fresh array."""
+        """(N, D) int64 states -> (N, *space.shape) of space.dtype, a fresh array. ParameterError: see `checked`."""
         raise NotImplementedError
+
+    def checked(self, states: np.ndarray) -> np.ndarray:
+        """States as (N, D) int64. Compiled drawings of other numbers would write where they must not.
+
+        Raises:
+            ParameterError: `states` is no table of integers with D columns, or a number lies outside of the range that
+                the environment declares for its component.
+        """
+        from pharos.kernels.observation_kernels import first_beyond_ranges
+
+        states, components = np.asarray(states), self.env.components
+        if states.ndim != 2 or states.shape[1] != len(components) or states.dtype.kind not in "iub":
+            raise ParameterError(
+                f"observation {self.name!r} of {self.env}: found states of shape {states.shape} and type "
+                f"{states.dtype}; expected integers of shape (N, {len(components)})"
+            )
+        states = states.astype(np.int64, copy=False)
+        if (n := first_beyond_ranges(states, components.low, components.size)) >= 0:
+            check_state(self.env, states[n].tolist())
+        return states
 
     def one(self, state: np.ndarray) -> np.ndarray:
         """The observation of one state (D,): a fresh array, or an integer if the space is Discrete."""
@@ -239,9 +260,7 @@ def observe(
         raise ParameterError(f"observation {observation.name!r} belongs to {observation.env}; expected one of {env}")
     else:
         instance, keywords = observation, []
-    for option in options:
-        if option not in keywords:
-            raise UnknownName(f"option of observation {instance.name!r}", option, keywords)
+    _check_known(instance.name, options, keywords)
     return instance
 
 
@@ -249,10 +268,25 @@ def _observation_and_keywords(
     make: Callable[..., Observation], env: Environment, state_space: "StateSpace | None", options: Mapping[str, Any]
 ) -> tuple[Observation, list[str]]:
     """The observation that `make` returns, and the names of its options: the keywords of `make`."""
-    parameters = inspect.signature(make).parameters
-    keywords = [name for name, parameter in parameters.items() if parameter.kind is parameter.KEYWORD_ONLY]
-    space = {"state_space": state_space} if "state_space" in parameters else {}
+    keywords = _keywords(make)
+    space = {"state_space": state_space} if "state_space" in inspect.signature(make).parameters else {}
     return make(env, **space, **{name: value for name, value in options.items() if name in keywords}), keywords
+
+
+def _keywords(make: Callable[..., Observation]) -> list[str]:
+    parameters = inspect.signature(make).parameters.values()
+    return [parameter.name for parameter in parameters if parameter.kind is parameter.KEYWORD_ONLY]
+
+
+def check_options(observation: object, options: Iterable[str]) -> None:
+    """UnknownName unless the observation has options of these names. Whether an environment has it is not asked."""
+    _check_known(str(observation), options, _keywords(_maker(observation)))
+
+
+def _check_known(name: str, options: Iterable[str], keywords: list[str]) -> None:
+    for option in options:
+        if option not in keywords:
+            raise UnknownName(f"option of observation {name!r}", option, keywords)
 
 
 def _maker(observation: object) -> Callable[..., Observation]:

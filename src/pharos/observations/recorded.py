@@ -84,7 +84,7 @@ class Recorded(Frames):
             self.space = Box(float(low), float(high), shown.shape[1:], np.float32)
 
     def frame(self, states: np.ndarray) -> np.ndarray:
-        numbers = states[:, 0]
+        numbers = self.checked(states)[:, 0]
         if not isinstance(self._shown, DistinctRows):
             return self._look(self._shown[numbers])
         length = math.prod(self.space.shape or ()) * self.space.dtype.itemsize // self.frames  # type: ignore[union-attr]

@@ -70,6 +70,7 @@ class Vector(Observation):
     def __call__(self, states: np.ndarray) -> np.ndarray:
         from pharos.kernels.observation_kernels import normalize
 
+        states = self.checked(states)
         out = np.zeros((len(states), len(self.names or ())), np.float32)
         normalize(states, self.low, self.scale, out)
         return out
@@ -123,6 +124,7 @@ class OneHot(Observation):
     def __call__(self, states: np.ndarray) -> np.ndarray:
         from pharos.kernels.observation_kernels import mark_components
 
+        states = self.checked(states)
         out = np.zeros((len(states), len(self.names or ())), np.int8)
         mark_components(states, self._low, self._offset, out)
         if len(self._starts):
@@ -187,7 +189,7 @@ class Number(Observation):
         self._low, self._sizes = components.low[self._columns], components.size[self._columns]
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
-        values = (np.asarray(states)[:, self._columns] - self._low).T
+        values = (self.checked(states)[:, self._columns] - self._low).T
         number = np.ravel_multi_index(tuple(values), tuple(self._sizes.tolist()))
         return np.where(number < self.space.n, number, 0).astype(np.int64)  # type: ignore[attr-defined]
 
@@ -235,6 +237,7 @@ class Hash(Observation):
     def __call__(self, states: np.ndarray) -> np.ndarray:
         from pharos.kernels.observation_kernels import scramble
 
+        states = self.checked(states)
         out = np.zeros((len(states), len(self.names or ())), np.int8)
         scramble(states, self._low, self._lengths, self._keys, out)
         return out

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from pharos.agents import agent_called, agent_source, hyperparameters
 from pharos.environments import Environment, as_tuples, class_source, import_class, make
 from pharos.errors import MissingExtra, ParameterError, UnknownName
-from pharos.observations import OwnObservation, names, own_observation, title
+from pharos.observations import OwnObservation, check_options, names, own_observation, title
 from pharos.study.regression import MODEL_MEASURES
 from pharos.system.sources import is_reference
 from pharos.system.storage import check_name
@@ -165,6 +165,13 @@ class ObservationEntry(_Named):
         elif name not in names():
             raise UnknownName("observation", name, names())
         return name
+
+    @field_validator("options")
+    @classmethod
+    def _are_known(cls, options: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+        if name := info.data.get("name"):  # else the name is wrong, and told
+            check_options(own_observation(name, (info.context or {}).get("folder")) or name, options)
+        return options
 
     @cached_property
     def own(self) -> OwnObservation | None:

@@ -8,7 +8,7 @@
     blocks:
       - environments: [frozen_lake/4x4, {name: frozen_lake, parameters: {size: 6, seed: 1}}]
         chance: [plain, {sticky: 0.25}, {random: 0.1}]
-        observations: [vector, {name: simple_image, options: {size: 84}}]
+        observations: [vector, {name: simple_image, options: {grey: true}}]
         agents: [dqn, ppo, q_learning]
         hyperparameters: {dqn: patient, ppo: {n_steps: 256}}
         engine: {dqn: batched}         # or a word for all agents; of the study if a block does not say

@@ -32,6 +32,13 @@ def usable_workers(workers: int | None) -> int:
     return int(workers)
 
 
+def check_timeout(timeout: float | None) -> None:
+    """ParameterError unless `timeout` is a number of seconds above 0, or None."""
+    is_number = isinstance(timeout, int | float) and not isinstance(timeout, bool)
+    if timeout is not None and not (is_number and timeout > 0):
+        raise ParameterError(f"timeout is {timeout!r}; expected a number of seconds above 0")
+
+
 def check_processes(processes: int | str) -> None:
     """Raise a ParameterError unless `processes` is 1 or "mpi"."""
     if processes != "mpi" and (processes != 1 or isinstance(processes, bool)):
