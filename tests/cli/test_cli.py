@@ -454,6 +454,7 @@ def test_render_draws_in_the_terminal(pharos):
         (["build"], "Missing argument"),
         (["bild", "breakout"], "No such command 'bild'"),
         (["build", "breakout", "--fast"], "No such option"),
+        (["study", "run", "--out"], "requires an argument. (see `pharos study run --help`)"),
         (["build", "breakout", "--shards", "/disk"], "--shards is gone: files stay in one folder"),
         (["solve", "breakout", "--jacobi"], "--jacobi is gone: values of any --processes are within --tolerance"),
         (["render", "breakout", "--observation", "humane"], "did you mean 'human'?"),

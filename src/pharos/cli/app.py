@@ -87,7 +87,7 @@ class _Group(TyperGroup):
             sys.stdout.flush()
             return code if isinstance(code, int) else 0
         except Exception as error:
-            code = EXIT_INTERRUPTED if _comes_from_interrupt(error) else _exit_code(error)
+            code = EXIT_INTERRUPTED if _comes_from_interrupt(error) else _exit_code(error, _command_of(self, words))
             if code is None:
                 raise
             return code
@@ -118,8 +118,8 @@ def _comes_from_interrupt(error: BaseException | None) -> bool:
     return error is not None
 
 
-def _exit_code(error: Exception) -> int | None:
-    """Print an error as one line on standard error and return its exit code. None for a bug of pharos."""
+def _exit_code(error: Exception, command: str) -> int | None:
+    """Print an error of a command as one line on standard error, return its exit code. None for a bug of pharos."""
     if isinstance(error, BrokenPipeError):  # the reader had enough, as in `pharos list | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_FAILED
@@ -145,14 +145,19 @@ def _exit_code(error: Exception) -> int | None:
     if hasattr(error, "format_message"):  # of typer, in whichever module this version has its exceptions
         text = error.format_message()
         name = getattr(error, "option_name", None) or "".join(text.split("'")[1:2])  # No such command 'NAME'.
-        complain(f"{REMOVED.get(f'{_command_of(error)} {name}') or text} (see `{_command_of(error)} --help`)")
+        complain(f"{REMOVED.get(f'{command} {name}') or text} (see `{command} --help`)")
         return EXIT_USAGE
     return None
 
 
-def _command_of(error: Exception) -> str:
-    context = getattr(error, "ctx", None)
-    return context.command_path if context is not None else "pharos"
+def _command_of(group: Any, words: list[str]) -> str:
+    """The command that words begin with: "pharos study run". Not all errors know theirs."""
+    path = ["pharos"]
+    for word in words:
+        if (group := getattr(group, "commands", {}).get(word)) is None:
+            break
+        path.append(word)
+    return " ".join(path)
 
 
 app = Commands(
