@@ -1,5 +1,7 @@
 """Actions that exist in some states only: constructors, values and measures, against plain Python."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import strategies as st
@@ -240,6 +242,21 @@ def test_what_is_no_set_is_refused(change, reason):
     arguments = {"next_states": [[1, 0], [0, 1]], "rewards": np.ones((2, 2)), **change}
     with pytest.raises(ParameterError, match=reason):
         TabularMDP.from_arrays(**arguments)
+
+
+def test_minus_infinity_for_an_action_that_is_available_is_no_reward():
+    mdp = TabularMDP.from_arrays([[1, 1], [0, 1], [-1, -1]], [[-1.0, -np.inf], [-2.0, -3.0], [0.0, 0.0]])
+    wrong = np.array([[-1.0, 0.0], [-2.0, -np.inf], [0.0, 0.0]])
+    outcomes = partial(TabularMDP.from_outcomes, [[[1], [1]], [[0], [1]], [[-1], [-1]]], np.ones((3, 2, 1)))
+    for call in (
+        lambda: mdp.with_rewards(wrong),
+        lambda: pharos.lazy_actions(mdp, 0.5, staying=wrong),
+        lambda: outcomes(wrong[:, :, None], available=mdp.available),
+    ):
+        assert "state 1, action 1" in refusal(ParameterError, call) and "-inf" in refusal(ParameterError, call)
+    right = np.array([[-1.0, -np.inf], [-2.0, -4.0], [-np.inf, -np.inf]])  # nothing is chosen in a terminal state
+    mdp = TabularMDP.from_arrays([[1, 1], [0, 1], [2, 2]], right, terminal=[False, False, True])
+    assert (mdp.with_rewards(right).rewards == [[-1.0, -1.0], [-2.0, -4.0], [0.0, 0.0]]).all()
 
 
 def test_an_empty_row_of_an_action_that_is_said_to_be_available_is_refused():

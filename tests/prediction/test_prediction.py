@@ -3,6 +3,7 @@
 import csv
 import itertools
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from pharos.observations import representation
 from pharos.prediction import Published, prediction, published
 from pharos.prediction.calibration import COMMON, OrderCounts
 from pharos.prediction.prediction import PairOrder
+from refusals import refusal
 
 CHOICES = Path(__file__).parents[2] / "docs" / "studies" / "choices"
 
@@ -157,8 +159,49 @@ def test_hyperparameters_that_the_agent_lacks_are_refused_and_those_without_effe
         pharos.predict("river_swim", length=5, hyperparameters={"learning_rat": 0.1})
     said = pharos.predict("river_swim", length=5, steps=1500, hyperparameters={"tau": 0.5}).warnings
     assert any(line.startswith("tau: no part of the idealised learner") for line in said)
+    assert len(pharos.predict("river_swim", ["vector", "vector"], length=5, steps=1500).cells) == 1
     coins = pharos.predict("river_swim", ["vector", ("vector", {"irrelevant": 2})], length=5, steps=1500).warnings
     assert sum("irrelevant entries are 0 in kernels" in line for line in coins) == 1
+    assert any(line.startswith("tau, n_steps: no part of") for line in unused_by({"tau": 0.5, "n_steps": 5}))
+    assert not any("no part of" in line for line in unused_by({"n_steps": 1, "policy_kwargs": {"net_arch": [128]}}))
+
+
+def unused_by(hyperparameters):
+    return pharos.predict("river_swim", length=5, steps=1500, common=True, hyperparameters=hyperparameters).warnings
+
+
+def test_steps_between_updates_are_read_in_both_forms():
+    of_list, of_number, other = (
+        pharos.predict(
+            "river_swim",
+            length=5,
+            steps=1500,
+            common=True,
+            hyperparameters={"train_freq": each, "learning_starts": 100},
+        )
+        for each in ([10, "step"], 10, 4)
+    )
+    assert of_list.cells[0].value == of_number.cells[0].value != other.cells[0].value
+
+
+@pytest.mark.parametrize(
+    ("agent", "hyperparameters", "reason"),
+    [
+        ("dqn", {"train_freq": (1, "episode")}, "train_freq is (1, 'episode'); expected a number"),
+        ("dqn", {"train_freq": 0}, "expected an integer of at least 1"),
+        ("dqn", {"batch_size": 2.5}, "expected an integer of at least 1"),
+        ("dqn", {"n_envs": 0}, "expected an integer of at least 1"),
+        ("dqn", {"gamma": None}, "gamma is None; expected a number"),
+        ("dqn", {"policy_kwargs": "dict(net_arch=[8])"}, "expected a mapping"),
+        ("dqn", {"net_arch": 64}, "expected a list of units"),
+        ("ppo", {"net_arch": "small"}, "expected a list of units"),
+        ("ppo", {"clip_range": "lin_0.2"}, "expected a number above 0"),
+        ("ppo", {"n_epochs": 2.7}, "expected an integer of at least 1"),
+    ],
+)
+def test_values_that_no_idealised_learner_has_are_refused(agent, hyperparameters, reason):
+    predicted = partial(pharos.predict, "river_swim", agent=agent, length=5, steps=1500, common=True)
+    assert reason in refusal(ParameterError, predicted, hyperparameters=hyperparameters)
 
 
 def test_a_unit_outside_of_what_was_tested_is_named():

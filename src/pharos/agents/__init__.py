@@ -20,6 +20,7 @@ from pharos.agents.agent import (
 from pharos.agents.idealised import (
     HUBER_PREDICTORS,
     NETWORK_CURVE,
+    NETWORK_OPTIONS,
     NETWORK_POLICY_PREDICTORS,
     NETWORK_PREDICTORS,
     POLICY_CURVES,
@@ -46,6 +47,7 @@ from pharos.agents.registry import (
 from pharos.agents.sb3 import (
     algorithm,
     check_hyperparameters,
+    check_values,
     extractor_class,
     make_model,
 )

@@ -35,6 +35,8 @@ POLICY_CURVES = ("policy_curve", "clipped_curve")
 NETWORK_CURVE = "network_curve"
 CURVE_POINTS = 40
 
+NETWORK_OPTIONS = ("net_arch", "policy_kwargs")
+
 Configuration = Mapping[str, Any]
 """The configuration of a run with all hyperparameters, as run.json keeps it."""
 
@@ -51,6 +53,7 @@ class Idealised:
         earlier: columns of earlier predictors, NaN where the predictor alone is computed.
         fallback: the measure in its place for a network whose output layer is not known, and for more different
             observations than it is for.
+        reads: the agent's hyperparameters that it learns by, numbers. `NETWORK_OPTIONS` are read with the network.
     """
 
     kind: str = "both"
@@ -59,6 +62,14 @@ class Idealised:
     suffix: str = "+tanh"
     fallback: str = ""
     earlier: tuple[str, ...] = ()
+    reads: tuple[str, ...] = ()
+
+    def check(self, hyperparameters: Mapping[str, Any]) -> None:
+        """ParameterError: one that it reads is no number. That is so for schedules, and for no clipping it is None."""
+        for name in self.reads:
+            value = hyperparameters.get(name, 0)
+            if not isinstance(value, int | float) and (name, value) != ("clip_range", None):
+                raise ParameterError(f"{name} is {value!r}; expected a number, as predictions are of one that stays")
 
     def schedule(self, config: Configuration) -> "Schedule":
         """The schedule of the agent."""
@@ -108,6 +119,14 @@ class IdealisedDQN(Idealised):
     earlier: tuple[str, ...] = HUBER_PREDICTORS
     initialisation: str = "pytorch"
     suffix: str = ""
+    reads: tuple[str, ...] = (
+        *("learning_rate", "max_grad_norm", "gamma", "batch_size", "buffer_size", "learning_starts", "train_freq"),
+        *("gradient_steps", "target_update_interval"),
+        *("exploration_initial_eps", "exploration_final_eps", "exploration_fraction"),
+    )
+
+    def check(self, hyperparameters: Mapping[str, Any]) -> None:
+        super().check({**hyperparameters, "train_freq": _steps_between(hyperparameters.get("train_freq", 4))})
 
     def schedule(self, config: Configuration) -> "Schedule":
         from pharos.hardness import Schedule
@@ -115,8 +134,8 @@ class IdealisedDQN(Idealised):
         hyperparameters = config["hyperparameters"]
         same = ("learning_starts", "exploration_initial_eps", "exploration_final_eps", "exploration_fraction", "gamma")
         options = {name: hyperparameters[name] for name in same if name in hyperparameters}
-        period, every = int(hyperparameters.get("target_update_interval", 250)), hyperparameters.get("train_freq", 4)
-        every = every if isinstance(every, int) else 4
+        period = int(hyperparameters.get("target_update_interval", 250))
+        every = _steps_between(hyperparameters.get("train_freq", 4))
         copies = int(hyperparameters.get("gradient_steps", 1))
         steps = max(1, round(period * (copies / every if copies > 0 else 1.0)))
         return Schedule(steps=config["steps"], period=period, gradient_steps=steps, **options)
@@ -161,6 +180,10 @@ class IdealisedActorCritic(Idealised):
 
     kind: str = "ppo"
     earlier: tuple[str, ...] = POLICY_PREDICTORS
+    reads: tuple[str, ...] = (
+        *("learning_rate", "max_grad_norm", "gamma", "gae_lambda", "n_steps", "n_envs", "batch_size", "n_epochs"),
+        *("clip_range", "ent_coef", "vf_coef"),
+    )
     gae_lambda: float = 0.95
     clip_range: float | None = None
 
@@ -247,18 +270,17 @@ class IdealisedActorCritic(Idealised):
         return LearningCurve(**{name: np.asarray(values) for name, values in value["curve"].items()}).mean_evaluated
 
 
-def _adam(hyperparameters: Mapping[str, Any], **defaults: float) -> "Adam":
-    """Adam of an agent. defaults: of Stable-Baselines3, if its hyperparameters do not say.
+def _steps_between(train_freq: Any) -> Any:
+    """Steps from one update to the next: 4 of [4, "step"], as Stable-Baselines3 writes it too. Else as it is."""
+    is_pair = isinstance(train_freq, Sequence) and not isinstance(train_freq, str) and len(train_freq) == 2
+    return train_freq[0] if is_pair and train_freq[1] == "step" else train_freq
 
-    Raises:
-        ParameterError: the learning rate is a schedule.
-    """
+
+def _adam(hyperparameters: Mapping[str, Any], **defaults: float) -> "Adam":
+    """Adam of an agent. defaults: of Stable-Baselines3, if its hyperparameters do not say."""
     from pharos.hardness import Adam
 
     own = {name: hyperparameters[name] for name in ("learning_rate", "max_grad_norm") if name in hyperparameters}
-    for name, value in own.items():
-        if not isinstance(value, int | float):
-            raise ParameterError(f"{name} is {value!r}; expected a number, as predictions are of one that stays")
     return Adam(**{**defaults, **{name: float(value) for name, value in own.items()}})
 
 

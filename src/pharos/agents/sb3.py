@@ -139,10 +139,11 @@ def check_hyperparameters(
         for hyperparameter in hyperparameters:
             if hyperparameter not in names:
                 raise UnknownName(f"hyperparameter of {name}", hyperparameter, names)
-    _check_values(name, hyperparameters)
+    check_values(name, hyperparameters)
 
 
-def _check_values(name: str, hyperparameters: Mapping[str, Any]) -> None:
+def check_values(name: str, hyperparameters: Mapping[str, Any]) -> None:
+    """ParameterError: a number is out of the range of its hyperparameter, or something else stands for it."""
     for hyperparameter, value in hyperparameters.items():
         expected = _expected(hyperparameter, value)
         if expected is not None:
@@ -295,7 +296,7 @@ class DeepAgent(Agent):
         check_hyperparameters(self.name, hyperparameters)
 
     def check_before(self, hyperparameters: Mapping[str, Any], engine: str) -> None:
-        _check_values(_title(self.name), hyperparameters)
+        check_values(_title(self.name), hyperparameters)
         if not {*hyperparameters} <= {*self.defaults, *self.space, *self.benchmark_defaults}:
             with contextlib.suppress(MissingExtra):
                 self.check(hyperparameters, engine)

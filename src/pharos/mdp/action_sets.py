@@ -49,9 +49,12 @@ def stand_ins(sets: np.ndarray) -> np.ndarray:
 
 def filled(array: np.ndarray, sets: np.ndarray) -> np.ndarray:
     """An array (S, A, ...) with the entries of unavailable actions replaced. If a state has no available action, -inf
-    by 0."""
+    by 0. That of an available one stays, and is refused as any other number that is not finite."""
     result = array[np.arange(len(sets))[:, None], stand_ins(sets)]
-    return np.where(result == -np.inf, 0.0, result) if result.dtype.kind == "f" else result
+    if result.dtype.kind == "f":
+        without = ~sets.any(axis=1)
+        result[without] = np.where(result[without] == -np.inf, 0.0, result[without])
+    return result
 
 
 def with_sets(mdp: "TabularMDP", sets: np.ndarray | None) -> "TabularMDP":

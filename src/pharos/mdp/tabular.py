@@ -224,9 +224,10 @@ class TabularMDP:
         return replace(self, horizon=horizon)
 
     def with_rewards(self, rewards: npt.ArrayLike) -> "TabularMDP":
-        """The same MDP with other rewards, (S, A). Rewards of terminal states must be 0."""
+        """The same MDP with other rewards, (S, A). Rewards of terminal states must be 0. Those of unavailable actions
+        count for nothing. ParameterError: another reward is not finite."""
         if self.available is not None and np.shape(rewards) == self.available.shape:
-            rewards = filled(np.asarray(rewards, np.float64), self.available)
+            rewards = filled(np.asarray(rewards, np.float64), self.available & ~self.terminal[:, None])
         table = rewards_of_shape(rewards, self.reward_table.shape)
         wrong = self.terminal[:, None] & (table.array != 0)
         if wrong.any():

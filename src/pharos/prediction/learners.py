@@ -1,12 +1,13 @@
 """The idealised learner of a run: an agent's network as a kernel, and its schedule, from the run's configuration."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from pharos.agents import agent_called, curve_points, primary_predictors
 from pharos.errors import ParameterError, PharosError
+from pharos.mdp import whole_number
 from pharos.training import RunConfig
 
 if TYPE_CHECKING:
@@ -54,6 +55,7 @@ def predicted(config: Mapping[str, Any], *, primary: bool = False) -> dict[str, 
         if primary:
             return row | _of_primary(config, task.mdp, options)
         idealised = agent_called(config["agent"]).idealised
+        idealised.check(config["hyperparameters"])
         schedule = idealised.schedule(config)
         user_measures = own_measures()
         measures = report(task.mdp, (*LEARNER_MEASURES, *user_measures), schedule=schedule, **options)
@@ -102,6 +104,7 @@ def _idealised(config: Mapping[str, Any]) -> "Idealised":
     if not idealised.predictor:
         expected = ", ".join(primary_predictors())
         raise ParameterError(f"agent {config['agent']} has no primary predictor; expected one of {expected}")
+    idealised.check(config["hyperparameters"])
     return idealised
 
 
@@ -215,7 +218,10 @@ def _hidden_layers(hyperparameters: Mapping[str, Any]) -> list[int]:
     Raises:
         ParameterError: they differ, or the network is not of the kind that has a closed form.
     """
-    arguments = dict(hyperparameters.get("policy_kwargs") or {})
+    given = hyperparameters.get("policy_kwargs") or {}
+    if not isinstance(given, Mapping):
+        raise ParameterError(f"policy_kwargs is {given!r}; expected a mapping")
+    arguments = dict(given)
     layers = arguments.pop("net_arch", hyperparameters.get("net_arch", [128]))
     if arguments:
         raise ParameterError(f"policy_kwargs has {min(arguments)!r}; only net_arch may differ for predictions")
@@ -223,4 +229,6 @@ def _hidden_layers(hyperparameters: Mapping[str, Any]) -> list[int]:
         if layers.get("pi") != layers.get("vf"):
             raise ParameterError(f"net_arch is {dict(layers)}; predictions need the same layers for policy and value")
         layers = layers.get("pi") or []
-    return list(layers)
+    if isinstance(layers, str) or not isinstance(layers, Sequence):
+        raise ParameterError(f"net_arch is {layers!r}; expected a list of units, such as [64, 64]")
+    return [whole_number(units, "a layer of net_arch") for units in layers]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.agents import agent_called, check_hyperparameters, primary_predictors
+from pharos.agents import NETWORK_OPTIONS, agent_called, check_hyperparameters, check_values, primary_predictors
 from pharos.environments import Environment
 from pharos.errors import MissingExtra, ParameterError, UnknownName
 from pharos.prediction.calibration import COMMON, LEVEL, OrderCounts, Published, published
@@ -354,13 +354,18 @@ def _observations(observations: Any) -> list[tuple[str, dict[str, Any]]]:
     is_pair = isinstance(observations, tuple) and len(observations) == 2 and isinstance(observations[1], Mapping)
     if isinstance(observations, str) or is_pair:
         observations = [observations]
-    return [(each, {}) if isinstance(each, str) else (each[0], dict(each[1])) for each in observations]
+    return _each_once((each, {}) if isinstance(each, str) else (each[0], dict(each[1])) for each in observations)
 
 
 def _several(networks: "str | Callable[..., Any] | Iterable[Any] | None") -> list[Any]:
     if networks is None or isinstance(networks, str) or callable(networks):
         return [networks]
-    return list(networks)
+    return _each_once(networks)
+
+
+def _each_once(values: Iterable[Any]) -> list[Any]:
+    every = list(values)
+    return [value for i, value in enumerate(every) if value not in every[:i]]
 
 
 def _checked_states(states: int, env: Environment) -> int:
@@ -374,8 +379,9 @@ def _checked_states(states: int, env: Environment) -> int:
 
 def _check_steps(config: Mapping[str, Any]) -> None:
     """Refuse a training that ends before anything is learnt."""
-    steps = config["steps"]
-    min_steps, what = agent_called(config["agent"]).idealised.min_steps(config)
+    steps, idealised = config["steps"], agent_called(config["agent"]).idealised
+    idealised.check(config["hyperparameters"])
+    min_steps, what = idealised.min_steps(config)
     if steps < min_steps:
         raise ParameterError(
             f"steps is {steps}, but {what} after {min_steps - 1:,} steps; expected at least {min_steps:,}"
@@ -415,19 +421,26 @@ COINS = "irrelevant entries are 0 in kernels, so what they do to an agent is not
 
 
 def _unused_hyperparameters(agent: str, overrides: Mapping[str, Any]) -> list[str]:
-    """A line if hyperparameters are no part of the idealised learner. UnknownName: nor has the agent one of them."""
+    """A line if hyperparameters are no part of the idealised learner.
+
+    Raises:
+        UnknownName: nor has the agent one of them. ParameterError: a value is out of range.
+    """
     from pharos.agents.batched import OWN_OPTIONS
 
+    check_values(agent, overrides)
     own = agent_called(agent)
-    used = {*COMMON[agent], *own.defaults, *own.space, "net_arch", "max_grad_norm", "vf_coef"}
-    further = [name for name in overrides if name not in used]
-    if not further:
-        return []
+    known = {*COMMON[agent], *own.defaults, *own.space, *own.idealised.reads, *NETWORK_OPTIONS}
+    further = [name for name in overrides if name not in known]
     try:
-        check_hyperparameters(agent, {name: overrides[name] for name in further}, OWN_OPTIONS)
+        if further:
+            check_hyperparameters(agent, {name: overrides[name] for name in further}, OWN_OPTIONS)
     except MissingExtra:
-        raise UnknownName(f"hyperparameter of {agent}", further[0], sorted(used)) from None
-    return [f"{', '.join(further)}: no part of the idealised learner, which learns the same without"]
+        raise UnknownName(f"hyperparameter of {agent}", further[0], sorted(known)) from None
+    common = {**own.benchmark_defaults, **COMMON[agent]}
+    read = (*own.idealised.reads, *NETWORK_OPTIONS)
+    unused = [name for name, value in overrides.items() if name not in read and common.get(name) != value]
+    return [f"{', '.join(unused)}: no part of the idealised learner, which learns the same without"] if unused else []
 
 
 def _other_hyperparameters(agent: str, settings: Mapping[str, Any]) -> Iterable[str]:
