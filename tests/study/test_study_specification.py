@@ -137,6 +137,11 @@ def test_defaults_of_a_study_go_before_those_of_the_library_and_below_those_of_a
         (12, "    agents: [dqn]", "specification:12: the key 'agents' stands there twice (line 11)"),
         (12, "    hyperparameters: [", "specification:13"),
         (2, "defaults: {dqm: {frozen_lake: {}}}", "specification:2: unknown agent 'dqm'; did you mean 'dqn'?"),
+        (2, "defaults: {dqn: {frozen_lke: {}}}", "specification:2: unknown class of environments 'frozen_lke'; did you mean 'frozen_lake'?"),  # noqa: E501
+        (2, "defaults: {dqn: {default: {}}}", "specification:2: unknown class of environments 'default'"),
+        (2, "defaults: {dqn: {frozen_lake: {vectr: {}}}}", "specification:2: unknown observation 'vectr'; did you mean 'vector'?"),  # noqa: E501
+        (2, "defaults: {dqn: {frozen_lake: {vector: {learnin_rate: 1}}}}", "specification:2: unknown hyperparameter of dqn 'learnin_rate'"),  # noqa: E501
+        (2, "defaults: {dqn: {frozen_lake: {vector: {learning_rate: -1}}}}", "specification:2: agent 'dqn': learning_rate is -1"),  # noqa: E501
         (1, "blocks: 3\nname: a", "specification:8: the key 'blocks' stands there twice (line 1)"),
     ],
 )  # fmt: skip

@@ -32,7 +32,9 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from pharos.agents import agent_called, agent_source, agents, is_known
+from pharos.environments import class_called, classes
 from pharos.errors import ParameterError, UnknownName
+from pharos.observations import names
 from pharos.study.blocks import (
     MOST_RUNS,
     Block,
@@ -279,9 +281,7 @@ def _wrong(specification: Specification) -> Iterator[tuple[Loc, str]]:
     """Yield (path, message) for mistakes that only the whole specification shows: names of agents and of
     hyperparameters, environments that cannot be made."""
     number = 0
-    for agent in specification.defaults:
-        if not _is_agent(agent):
-            yield ("defaults", agent), str(UnknownName("agent", agent, agents()))
+    yield from _wrong_defaults(specification)
     for i, block in enumerate(specification.blocks):
         kinds = len(block.environments) * len(block.chance) * len(block.agents) * len(block.observations)
         number += kinds * len(specification.option_of(block, "seeds"))
@@ -331,6 +331,38 @@ def _wrong(specification: Specification) -> Iterator[tuple[Loc, str]]:
                     agent_called(agent).check_before(values, specification.engine_of(block, agent))
                 except ParameterError as error:
                     yield loc, str(error)
+
+
+def _wrong_defaults(specification: Specification) -> Iterator[tuple[Loc, str]]:
+    """The same of `defaults`: agents, classes and observations that neither pharos nor the study has, and values."""
+    entries = [entry for block in specification.blocks for entry in block.environments]
+    own_classes = {name for entry in entries if (name := _class_of(entry)) is not None}
+    views = [view for block in specification.blocks for view in block.observations]
+    views += [view for entry in entries for view in entry.observations or ()]
+    known_observations = [*names(), *(str(view.own) for view in views if view.own is not None)]
+    for agent, of_agent in specification.defaults.items():
+        if not _is_agent(agent):
+            yield ("defaults", agent), str(UnknownName("agent", agent, agents()))
+            continue
+        engines = [specification.engine_of(block, agent) for block in specification.blocks if agent in block.agents]
+        for name, of_class in of_agent.items():
+            if name not in own_classes and class_called(name) is None:
+                yield ("defaults", agent, name), str(UnknownName("class of environments", name, classes()))
+            for observation, values in of_class.items():
+                loc: Loc = ("defaults", agent, name, observation)
+                if observation not in known_observations:
+                    yield loc, str(UnknownName("observation", observation, known_observations))
+                try:
+                    agent_called(agent).check_before(values, (*engines, "sb3")[0])
+                except ParameterError as error:
+                    yield loc, str(error)
+
+
+def _class_of(entry: EnvironmentEntry) -> str | None:
+    try:
+        return entry.instance.name
+    except ParameterError:  # which the entry itself tells
+        return None
 
 
 def _is_agent(name: str) -> bool:
