@@ -43,6 +43,7 @@ def test_wrong_words_are_usage_errors(tmp_path):
     [
         (("--no-horizon", "--horizon", 5), "--no-horizon and --horizon 5 contradict each other"),
         (("--option", "hide=column"), "q_learning sees index whatever is asked for; leave out hide"),
+        (("--observation", "one_hot"), "q_learning sees index whatever is asked for; leave out observation one_hot"),
         (("--device", "cuda"), "--device cuda goes with --seeds"),
         (("--set", "initial_q=abc"), "initial_q is 'abc'; expected a finite number"),
         (("--set", "sees_previous_action=no"), "sees_previous_action is 'no'; expected true or false"),

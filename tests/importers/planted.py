@@ -145,6 +145,20 @@ class Place(Walk):
         return self.cell, {}
 
 
+class MasksInInformation(Walk):
+    """Says with its reset which actions are allowed."""
+
+    def reset(self, *, seed=None, options=None):
+        return super().reset(seed=seed)[0], {"action_mask": np.array([1, 0], np.int8)}
+
+
+class MasksInMethod(Walk):
+    """Says which actions are allowed when it is asked."""
+
+    def action_masks(self):
+        return np.array([True, self.cell > 0])
+
+
 class Clock(Walk):
     """Counts its steps, and ends by that."""
 

@@ -457,6 +457,13 @@ def test_what_an_environment_prints_is_one_line_each():
     assert "it warned: old style" in text
 
 
+@pytest.mark.parametrize("base", [planted.MasksInInformation, planted.MasksInMethod])
+def test_action_masks_that_are_not_read_are_named(base):
+    mdp, recording = importers.stepping(base)
+    assert mdp.available is None
+    assert "its action masks are not read" in "".join(recording.notes)
+
+
 # Games ----------------------------------------------------------------------------------------------------------------
 
 

@@ -19,8 +19,8 @@ from pharos.agents.agent import (
 )
 from pharos.agents.idealised import (
     HUBER_PREDICTORS,
+    LAYER_OPTIONS,
     NETWORK_CURVE,
-    NETWORK_OPTIONS,
     NETWORK_POLICY_PREDICTORS,
     NETWORK_PREDICTORS,
     POLICY_CURVES,
@@ -47,7 +47,7 @@ from pharos.agents.registry import (
 from pharos.agents.sb3 import (
     algorithm,
     check_hyperparameters,
-    check_values,
+    check_ranges,
     extractor_class,
     make_model,
 )

@@ -213,7 +213,15 @@ class Agent:
     has_table: bool = False
 
     def observation(self, requested: str) -> str:
-        """The observation that the agent gets if `requested` is asked for."""
+        """The observation that the agent gets if `requested` is asked for.
+
+        Raises:
+            ParameterError: it sees another one. A vector, the default, counts as not asked for.
+        """
+        if self.fixed_observation is not None and requested not in (self.fixed_observation, "vector"):
+            raise ParameterError(
+                f"{self.name} sees {self.fixed_observation} whatever is asked for; leave out observation {requested}"
+            )
         return self.fixed_observation or requested
 
     def engine(self, requested: str) -> str:

@@ -35,7 +35,7 @@ POLICY_CURVES = ("policy_curve", "clipped_curve")
 NETWORK_CURVE = "network_curve"
 CURVE_POINTS = 40
 
-NETWORK_OPTIONS = ("net_arch", "policy_kwargs")
+LAYER_OPTIONS = ("net_arch", "policy_kwargs")
 
 Configuration = Mapping[str, Any]
 """The configuration of a run with all hyperparameters, as run.json keeps it."""
@@ -53,7 +53,7 @@ class Idealised:
         earlier: columns of earlier predictors, NaN where the predictor alone is computed.
         fallback: the measure in its place for a network whose output layer is not known, and for more different
             observations than it is for.
-        reads: the agent's hyperparameters that it learns by, numbers. `NETWORK_OPTIONS` are read with the network.
+        reads: the agent's hyperparameters that it learns by, numbers. `LAYER_OPTIONS` are read with the network.
     """
 
     kind: str = "both"
@@ -270,10 +270,17 @@ class IdealisedActorCritic(Idealised):
         return LearningCurve(**{name: np.asarray(values) for name, values in value["curve"].items()}).mean_evaluated
 
 
-def _steps_between(train_freq: Any) -> Any:
-    """Steps from one update to the next: 4 of [4, "step"], as Stable-Baselines3 writes it too. Else as it is."""
-    is_pair = isinstance(train_freq, Sequence) and not isinstance(train_freq, str) and len(train_freq) == 2
-    return train_freq[0] if is_pair and train_freq[1] == "step" else train_freq
+def _steps_between(train_freq: object) -> int:
+    """Steps from one update to the next: 4 of 4 and of [4, "step"], as Stable-Baselines3 writes it too.
+
+    Raises:
+        ParameterError: it is something else, such as episodes.
+    """
+    is_pair = isinstance(train_freq, list | tuple) and len(train_freq) == 2 and train_freq[1] == "step"
+    steps = train_freq[0] if is_pair else train_freq  # type: ignore[index]
+    if not isinstance(steps, int):
+        raise ParameterError(f"train_freq is {train_freq!r}; expected a number of steps, as predictions are of steps")
+    return steps
 
 
 def _adam(hyperparameters: Mapping[str, Any], **defaults: float) -> "Adam":

@@ -139,10 +139,10 @@ def check_hyperparameters(
         for hyperparameter in hyperparameters:
             if hyperparameter not in names:
                 raise UnknownName(f"hyperparameter of {name}", hyperparameter, names)
-    check_values(name, hyperparameters)
+    check_ranges(name, hyperparameters)
 
 
-def check_values(name: str, hyperparameters: Mapping[str, Any]) -> None:
+def check_ranges(name: str, hyperparameters: Mapping[str, Any]) -> None:
     """ParameterError: a number is out of the range of its hyperparameter, or something else stands for it."""
     for hyperparameter, value in hyperparameters.items():
         expected = _expected(hyperparameter, value)
@@ -296,7 +296,7 @@ class DeepAgent(Agent):
         check_hyperparameters(self.name, hyperparameters)
 
     def check_before(self, hyperparameters: Mapping[str, Any], engine: str) -> None:
-        check_values(_title(self.name), hyperparameters)
+        check_ranges(_title(self.name), hyperparameters)
         if not {*hyperparameters} <= {*self.defaults, *self.space, *self.benchmark_defaults}:
             with contextlib.suppress(MissingExtra):
                 self.check(hyperparameters, engine)

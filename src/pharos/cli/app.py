@@ -150,7 +150,7 @@ def _exit_code(error: Exception, command: str) -> int | None:
     return None
 
 
-def _command_of(group: Any, words: list[str]) -> str:
+def _command_of(group: object, words: list[str]) -> str:
     """The command that words begin with: "pharos study run". Not all errors know theirs."""
     path = ["pharos"]
     for word in words:

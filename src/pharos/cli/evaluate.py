@@ -3,6 +3,7 @@
 pharos evaluate: the exact value of a policy, between the best and the worst value.
 """
 
+import contextlib
 import math
 import time
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pharos.cli.answers import Answer, compiling_fact, describe_discount, progress_line, termination
+from pharos.cli.answers import Answer, compiling_fact, complain, describe_discount, progress_line, termination
 from pharos.cli.options import (
     Building,
     Chance,
@@ -175,7 +176,7 @@ def reaching(
             ends = [float(mdp.start_probabilities @ each[mdp.start_states]) for each in (bounds.lower, bounds.upper)]
             finite = [value if math.isfinite(value) else None for value in ends]
             numbers[key] = {"lower": finite[0], "upper": finite[1], "infinite": finite[0] is None}
-            facts.append((words, "infinite" if math.isinf(ends[0]) else f"{(ends[0] + ends[1]) / 2:.8g}"))
+            facts.append((words, _between(*ends)))
             arrays |= {f"{key}_lower": bounds.lower, f"{key}_upper": bounds.upper, f"{key}_policy": bounds.policy}
     if out is not None:
         if out.suffix.lower() == ".npy":
@@ -194,6 +195,13 @@ def reaching(
     best = "maximum" if cost is None or cost["infinite"] else "least_cost"
     rows = readable_policy(result.stopped, arrays[f"{best}_policy"], policy_rows, f"policy of the {REACHED[best]}")
     return with_policy(reply, rows)
+
+
+def _between(low: float, high: float) -> str:
+    """The middle of an interval in words, which says nothing of numbers that may be 0."""
+    if math.isinf(low):
+        return "infinite"
+    return f"at most {high:.2g}" if low == 0 < high else f"{(low + high) / 2:.8g}"
 
 
 def _how_it_was_answered(
@@ -335,7 +343,9 @@ def evaluate(
         goal = goal.as_environment()
     mdp = total_of(goal.mdp(building, gamma=gamma, horizon=horizon, chance=chance), *of_command, objective)
     if objective == "average":
-        return averaged(goal, mdp, policy, decisions, tolerance, chance, source)
+        reply = averaged(goal, mdp, policy, decisions, tolerance, chance, source)
+        _warn_of_another_world(decisions, goal)
+        return reply
     with progress_line("evaluating"):
         values = {name: _worth_of_named(mdp, name, tolerance) for name in NAMED_POLICIES}
         if decisions is None:
@@ -344,6 +354,7 @@ def evaluate(
             worth = _worth_over_histories(goal, mdp, decisions, chance)
         else:
             worth = _worth_of_given(goal, mdp, decisions, chance, tolerance)
+    _warn_of_another_world(decisions, goal)
     is_network = decisions is not None and "observation" in decisions.observer_options
     rounding = ", for the probabilities that its network computes in 32 bits" if is_network else ""
     best, uniform, worst = (values[name].value for name in NAMED_POLICIES)
@@ -383,6 +394,14 @@ def evaluate(
         ("chance", chance.in_words(mdp.dynamics.has_chance)),
     ]
     return Answer(answer, (f"{policy} policy on {target.title}", facts))
+
+
+def _warn_of_another_world(decisions: Given | None, goal: Target) -> None:
+    """Warn if a run learnt in another environment than its policy is evaluated in."""
+    task = None if decisions is None else decisions.task
+    with contextlib.suppress(ParameterError):  # a folder without its class has no other
+        if task is not None and (env := goal.found_environment()) != task.env:
+            complain(f"warning: the run learnt in {task.env}; its policy is evaluated in {env}")
 
 
 def averaged(

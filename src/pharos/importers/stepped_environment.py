@@ -23,7 +23,7 @@ from pharos.importers.side_effects import SideEffects
 from pharos.importers.snapshots import EnvironmentSnapshots, bare, chain_of, field_names, integers_of, snapshot_digest
 from pharos.importers.step_spaces import SpaceRecorder, listed_actions_of
 from pharos.importers.step_workers import ExpansionsElsewhere
-from pharos.importers.wrappers import Stepped, reset
+from pharos.importers.wrappers import Stepped, answer_of_reset, first_of, reset, tells_masks
 from pharos.system.wording import capped
 
 CHECKED_COPIES = 50
@@ -211,7 +211,14 @@ class SteppedEnvironment:
 
     def _prepare(self) -> None:
         """Reset once, so that generators are there that are made when they are first used; and share large tables."""
-        observation = self._reset(self._env, 0 if self.options.seed is None else self.options.seed)
+        seed = 0 if self.options.seed is None else self.options.seed
+        answer = self._calling("reset()", lambda: answer_of_reset(self._env, seed))
+        observation = first_of(answer)
+        if tells_masks(self._env, answer):
+            self.observer.notes.append(
+                f"{self.name}: its action masks are not read: every action is taken in every state, and does what step "
+                f"does with it"
+            )
         names = field_names(self._env) if self.options.ignore else set[str]()
         for name in sorted(self.options.ignore - names):
             raise UnknownName(f"field of {self.name}", name, names)

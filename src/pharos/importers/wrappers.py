@@ -74,7 +74,7 @@ class Recorder:
         vars(self).update(env=env, calls=[], observation=None, script=None)
 
     def reset(self, *, seed: int | None = None, options: object = None) -> Returned:
-        answer = _reset(self.env, seed, options)
+        answer = answer_of_reset(self.env, seed, options)
         self.observation = first_of(answer)
         self.calls.append(Call(None, None, table_state(self.env)))
         return answer
@@ -125,10 +125,20 @@ def table_state(env: Stepped) -> int | None:
 
 def reset(env: Stepped, seed: int | None = None) -> Returned:
     """The first observation of an episode, of environments with Gymnasium's interface or old gym's."""
-    return first_of(_reset(env, seed, None))
+    return first_of(answer_of_reset(env, seed))
 
 
-def _reset(env: Stepped, seed: int | None, options: object) -> Returned:
+def tells_masks(env: Stepped, answer: Returned) -> bool:
+    """Whether an environment says which actions are allowed: by `action_masks`, or in what a reset returned."""
+    has_information = first_of(answer) is not answer
+    in_reset = has_information and not {"action_mask", "action_masks"}.isdisjoint(answer[1])
+    return in_reset or any(
+        callable(getattr(each, "action_masks", None)) for each in (env, getattr(env, "unwrapped", env))
+    )
+
+
+def answer_of_reset(env: Stepped, seed: int | None, options: object = None) -> Returned:
+    """Answer of `reset`, with or without information beside the observation."""
     try:
         return env.reset(seed=seed, **({} if options is None else {"options": options}))
     except TypeError:  # old gym's takes nothing

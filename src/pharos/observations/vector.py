@@ -146,7 +146,10 @@ class Index(Observation):
         from gymnasium.spaces import Discrete
 
         if state_space is None:
-            raise ParameterError(f"{env}: observation 'index' needs the built state space: space=pharos.build(env)")
+            raise ParameterError(
+                f"{env}: observation 'index' needs the built state space: observe(env, 'index', "
+                f"state_space=pharos.build(env)), or space=pharos.build(env) of pharos.GymEnv"
+            )
         if state_space.environment != env:
             raise ParameterError(
                 f"observation 'index': the state space belongs to {state_space.environment}; expected one of {env}"

@@ -218,10 +218,10 @@ def _hidden_layers(hyperparameters: Mapping[str, Any]) -> list[int]:
     Raises:
         ParameterError: they differ, or the network is not of the kind that has a closed form.
     """
-    given = hyperparameters.get("policy_kwargs") or {}
-    if not isinstance(given, Mapping):
-        raise ParameterError(f"policy_kwargs is {given!r}; expected a mapping")
-    arguments = dict(given)
+    arguments = hyperparameters.get("policy_kwargs") or {}
+    if not isinstance(arguments, Mapping):
+        raise ParameterError(f"policy_kwargs is {arguments!r}; expected a mapping")
+    arguments = dict(arguments)
     layers = arguments.pop("net_arch", hyperparameters.get("net_arch", [128]))
     if arguments:
         raise ParameterError(f"policy_kwargs has {min(arguments)!r}; only net_arch may differ for predictions")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pharos.agents import NETWORK_OPTIONS, agent_called, check_hyperparameters, check_values, primary_predictors
+from pharos.agents import LAYER_OPTIONS, agent_called, check_hyperparameters, check_ranges, primary_predictors
 from pharos.environments import Environment
 from pharos.errors import MissingExtra, ParameterError, UnknownName
 from pharos.prediction.calibration import COMMON, LEVEL, OrderCounts, Published, published
@@ -428,17 +428,17 @@ def _unused_hyperparameters(agent: str, overrides: Mapping[str, Any]) -> list[st
     """
     from pharos.agents.batched import OWN_OPTIONS
 
-    check_values(agent, overrides)
+    check_ranges(agent, overrides)
     own = agent_called(agent)
-    known = {*COMMON[agent], *own.defaults, *own.space, *own.idealised.reads, *NETWORK_OPTIONS}
-    further = [name for name in overrides if name not in known]
+    names = {*COMMON[agent], *own.defaults, *own.space, *own.idealised.reads, *LAYER_OPTIONS}
+    further = [name for name in overrides if name not in names]
     try:
         if further:
             check_hyperparameters(agent, {name: overrides[name] for name in further}, OWN_OPTIONS)
     except MissingExtra:
-        raise UnknownName(f"hyperparameter of {agent}", further[0], sorted(known)) from None
+        raise UnknownName(f"hyperparameter of {agent}", further[0], sorted(names)) from None
     common = {**own.benchmark_defaults, **COMMON[agent]}
-    read = (*own.idealised.reads, *NETWORK_OPTIONS)
+    read = (*own.idealised.reads, *LAYER_OPTIONS)
     unused = [name for name, value in overrides.items() if name not in read and common.get(name) != value]
     return [f"{', '.join(unused)}: no part of the idealised learner, which learns the same without"] if unused else []
 

@@ -254,7 +254,10 @@ def _with_environments(data: Mapping[str, Any], name: str, entries: list[Any] | 
     listed = blocks if isinstance(blocks, list) else []
     are_open = [isinstance(block, Mapping) and block.get("environments") == GIVEN for block in listed]
     if any(are_open) and entries is None:
-        raise ParameterError(f"{name}: has no environments of its own; give a list of them: --environments FILE")
+        raise ParameterError(
+            f"{name}: has no environments of its own; give a list of them, --environments FILE, or the folder of a "
+            f"study that was run with one"
+        )
     if entries is None:
         return data
     if not any(are_open):
