@@ -65,7 +65,7 @@ class Idealised:
     reads: tuple[str, ...] = ()
 
     def check(self, hyperparameters: Mapping[str, Any]) -> None:
-        """ParameterError: one that it reads is no number. That is so for schedules, and for no clipping it is None."""
+        """ParameterError: a hyperparameter that it reads is no number, such as a schedule. None is no clipping."""
         for name in self.reads:
             value = hyperparameters.get(name, 0)
             if not isinstance(value, int | float) and (name, value) != ("clip_range", None):

@@ -4,7 +4,7 @@ import numpy as np
 
 from pharos.environments import NO_ACTION
 from pharos.errors import ParameterError
-from pharos.observations.observation import Observation
+from pharos.observations.observation import Observation, kernels
 from pharos.observations.vector import Vector
 
 Seen = np.ndarray | dict[str, np.ndarray]  # one observation or a batch of them; a dict if there are several parts
@@ -85,10 +85,8 @@ class ObservationInContext:
         if self.is_plain:
             return self.observation(states)
         if self.vector is not None:
-            from pharos.kernels.observation_kernels import normalize
-
             out = np.zeros((len(states), *self.space.shape), np.float32)  # type: ignore[misc]
-            normalize(states, self.vector.low, self.vector.scale, out)
+            kernels().normalize(states, self.vector.low, self.vector.scale, out)
             column = states.shape[1]
             if coins is not None:
                 out[:, column : column + coins.shape[1]] = coins

@@ -10,8 +10,9 @@ import importlib
 import inspect
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
@@ -28,6 +29,14 @@ if TYPE_CHECKING:
     from pharos.state_space import StateSpace
 
 Function = Callable[[Environment, np.ndarray], np.ndarray]
+
+
+@cache
+def kernels() -> ModuleType:
+    """Compiled functions of blocks of states. An import at every call would take as long as they do."""
+    from pharos.kernels import observation_kernels
+
+    return observation_kernels
 
 
 class Observation:
@@ -67,8 +76,6 @@ class Observation:
             ParameterError: `states` is no table of integers with D columns, or a number lies outside of the range that
                 the environment declares for its component.
         """
-        from pharos.kernels.observation_kernels import first_beyond_ranges
-
         states, components = np.asarray(states), self.env.components
         if states.ndim != 2 or states.shape[1] != len(components) or states.dtype.kind not in "iub":
             raise ParameterError(
@@ -76,7 +83,7 @@ class Observation:
                 f"{states.dtype}; expected integers of shape (N, {len(components)})"
             )
         states = states.astype(np.int64, copy=False)
-        if (n := first_beyond_ranges(states, components.low, components.size)) >= 0:
+        if (n := kernels().first_beyond_ranges(states, components.low, components.size)) >= 0:
             check_state(self.env, states[n].tolist())
         return states
 

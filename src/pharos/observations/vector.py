@@ -11,7 +11,7 @@ import numpy as np
 from pharos.environments import Environment
 from pharos.errors import ParameterError
 from pharos.mdp import whole_number
-from pharos.observations.observation import Observation, hidden_names
+from pharos.observations.observation import Observation, hidden_names, kernels
 
 if TYPE_CHECKING:
     from pharos.state_space import StateSpace
@@ -68,11 +68,9 @@ class Vector(Observation):
         self.space = Box(0.0, 1.0, (len(self.names),), np.float32)
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
-        from pharos.kernels.observation_kernels import normalize
-
         states = self.checked(states)
         out = np.zeros((len(states), len(self.names or ())), np.float32)
-        normalize(states, self.low, self.scale, out)
+        kernels().normalize(states, self.low, self.scale, out)
         return out
 
 
@@ -122,11 +120,9 @@ class OneHot(Observation):
         self._starts = np.array([state for state, _ in starts], np.int64)
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
-        from pharos.kernels.observation_kernels import mark_components
-
         states = self.checked(states)
         out = np.zeros((len(states), len(self.names or ())), np.int8)
-        mark_components(states, self._low, self._offset, out)
+        kernels().mark_components(states, self._low, self._offset, out)
         if len(self._starts):
             is_start = np.zeros(len(states), bool)
             for start in self._starts:
@@ -238,11 +234,9 @@ class Hash(Observation):
         self._keys = np.random.SeedSequence(seed).generate_state(HASH_ROUNDS, np.uint64)
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
-        from pharos.kernels.observation_kernels import scramble
-
         states = self.checked(states)
         out = np.zeros((len(states), len(self.names or ())), np.int8)
-        scramble(states, self._low, self._lengths, self._keys, out)
+        kernels().scramble(states, self._low, self._lengths, self._keys, out)
         return out
 
 
