@@ -273,6 +273,9 @@ def test_the_start_eccentricity_is_the_largest_mean_distance(mdp, data):
     assert found.exact
     if np.isinf(d).any():
         assert found.lower == found.upper == math.inf
+        pairs = [(np.isinf(row).sum(), row[np.isfinite(row)].max()) for row in d if np.isinf(row).any()]
+        assert (found.unreachable_pairs, found.finite_part) in pairs
+        assert found.counted == (len(set(starts)) == 1)
     else:
         expected = Fraction(int(d.sum(axis=0).max()), len(starts))
         assert Fraction(found.lower) <= expected <= Fraction(found.upper)

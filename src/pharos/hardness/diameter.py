@@ -147,7 +147,7 @@ def start_eccentricity_interval(
         return lean_eccentricity(graph, int(starts[0]), spending)
     weights = mdp.start_probabilities[mdp.start_probabilities > 0]
     mean, distance = np.zeros(graph.num_nodes), np.empty(graph.num_nodes, np.int32)
-    note, infinite, largest = "", False, 0
+    note, unreachable, largest = "", 0, 0
     for start, weight in zip(starts, weights, strict=True):
         if spending.is_over and spending.searches:
             num_starts = pluralize(len(starts), "start state")
@@ -156,10 +156,10 @@ def start_eccentricity_interval(
         num_reached, largest, _ = graph.search_forward(int(start), distance)
         spending.searches += 1
         if num_reached < graph.num_nodes:
-            infinite = True
+            unreachable = graph.num_nodes - int(num_reached)
             break
         mean += weight * distance
-    if infinite:
+    if unreachable:
         lower = upper = math.inf
     elif len(starts) == 1:
         lower = upper = float(largest)
@@ -172,7 +172,9 @@ def start_eccentricity_interval(
         lower,
         upper,
         exact=not note,
-        finite_part=0.0 if infinite else lower,
+        unreachable_pairs=unreachable,
+        finite_part=float(largest) if unreachable else lower,
+        counted=not unreachable or len(starts) == 1,
         tolerance=0.0 if len(starts) == 1 else tolerance,
         method="a breadth-first search from each start state",
         note=note,
