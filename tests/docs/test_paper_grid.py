@@ -8,6 +8,7 @@ import pytest
 pytest.importorskip("pyarrow.parquet")
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "evidence" / "paper-grid.md").read_text(encoding="utf-8")
+WORDS = " ".join(PAGE.split())
 RETURN = "return, mean ± deviation"
 # How the text above a table begins -> packed runs, agent, observation, and its columns of (return ± deviation, policies
 # at the end, normalised regret)
@@ -75,3 +76,29 @@ def test_images_under_chance_are_those_of_the_later_runs(monkeypatch):
                 check(text, some["normalized_regret"].mean())
                 number += observation == "simple_image"
     assert 5 * number == len(runs["simple_image"])  # nothing is left out
+    assert len(runs["simple_image"]) == 200 and "says that 2,100 of 2,100 runs are finished" in WORDS
+    means = {
+        observation: some[(some["agent"] == "dqn") & (some["observation"] == observation)]
+        .groupby(["instance", "chance"])["normalized_regret"]
+        .mean()
+        for observation, some in runs.items()
+    }
+    is_less = means["simple_image"] < means["vector"].loc[means["simple_image"].index]
+    by_class = is_less.groupby(is_less.index.get_level_values("instance").str.split("/").str[0]).sum()
+    assert by_class.to_dict() == {"breakout": 20 - 18, "freeway": 20}
+    assert (
+        "less regret than vectors in all twenty cells of Freeway, and more in eighteen of twenty of Breakout" in WORDS
+    )
+
+
+@pytest.mark.long
+def test_the_hours_of_the_whole_grid_are_those_of_its_records(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "scripts")
+    packed = importlib.import_module("article").packed
+    runs = pytest.importorskip("pandas").concat([packed(f"paper/{name}.parquet")[0] for name in ("runs", "later-runs")])
+    hours = runs["seconds"] / 3600
+    of_images = (runs["agent"] == "dqn") & (runs["observation"] == "simple_image")
+    of_images &= runs["instance"].str.match("freeway|breakout")
+    assert len(runs) == 2100 and f"add up to {hours.sum():.0f} hours" in WORDS
+    assert hours[of_images].sum() / hours.sum() == pytest.approx(0.5, abs=0.02)
+    assert "of which DQN with images on the large instances has half" in WORDS

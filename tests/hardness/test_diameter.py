@@ -1,5 +1,6 @@
 """The diameter of deterministic MDPs: against all pairs, theory, and its own intervals."""
 
+import importlib
 import math
 import time
 from fractions import Fraction
@@ -279,6 +280,17 @@ def test_the_start_eccentricity_is_the_largest_mean_distance(mdp, data):
     else:
         expected = Fraction(int(d.sum(axis=0).max()), len(starts))
         assert Fraction(found.lower) <= expected <= Fraction(found.upper)
+
+
+def test_states_out_of_reach_are_counted_by_both_searches(monkeypatch):
+    mdp = TabularMDP.from_arrays([[1, 1], [0, 1], [0, 2], [3, 3]], np.ones((4, 2)))
+    found = hardness.start_eccentricity_interval(mdp)
+    monkeypatch.setattr(
+        importlib.import_module("pharos.hardness.diameter"), "needs_more_than_memory", lambda graph: True
+    )
+    assert (
+        str(found) == str(hardness.start_eccentricity_interval(mdp)) == "infinite (2 unreachable pairs; else up to 1)"
+    )
 
 
 def test_the_interval_of_a_mean_distance_holds_its_exact_fraction():

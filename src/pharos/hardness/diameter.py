@@ -370,10 +370,10 @@ def lean_eccentricity(graph: Graph, source: int, spending: BudgetClock) -> Inter
         lambda dtype: LeanGraph(graph, dtype).search_forward(source, large_zeros((graph.num_nodes,), dtype))
     )
     spending.searches += 1
-    is_whole = reach == graph.num_nodes
-    value = float(largest) if is_whole else math.inf
+    unreachable = graph.num_nodes - int(reach)
+    value = math.inf if unreachable else float(largest)
     method = "a breadth-first search, by sweeps over the table"
-    return spending.signed(Interval(value, value, True, finite_part=value if is_whole else 0.0, method=method))
+    return spending.signed(Interval(value, value, True, unreachable, float(largest), method=method))
 
 
 def _in_two_bytes_or_four(result: Callable[[Integers], Result]) -> Result:

@@ -338,6 +338,8 @@ def _wrong(specification: Specification) -> Iterator[tuple[Loc, str]]:
 
 def _wrong_defaults(specification: Specification) -> Iterator[tuple[Loc, str]]:
     """The same of `defaults`: agents, classes and observations that neither pharos nor the study has, and values."""
+    if not specification.defaults:
+        return
     entries = [entry for block in specification.blocks for entry in block.environments]
     own_classes = {name for entry in entries if (name := _class_of(entry)) is not None}
     views = [view for block in specification.blocks for view in block.observations]
