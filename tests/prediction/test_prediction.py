@@ -171,12 +171,12 @@ def unused_by(hyperparameters):
 
 
 def test_steps_between_updates_are_read_in_both_forms():
-    of_list, of_number, other = (
+    of_list, of_number, of_array, other = (
         pharos.predict("deep_sea", size=5, steps=3000, common=True, hyperparameters={**early, "train_freq": each})
         for early in [{"learning_starts": 100}]
-        for each in ([10, "step"], 10, 4)
+        for each in ([10, "step"], 10, np.int64(10), 4)
     )
-    assert of_list.cells[0].value == of_number.cells[0].value != other.cells[0].value
+    assert of_list.cells[0].value == of_number.cells[0].value == of_array.cells[0].value != other.cells[0].value
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ Each says which network stands for the agent's, what it draws, and which columns
 
 import json
 import math
+import numbers
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -68,7 +69,7 @@ class Idealised:
         """ParameterError: a hyperparameter that it reads is no number, such as a schedule. None is no clipping."""
         for name in self.reads:
             value = hyperparameters.get(name, 0)
-            if not isinstance(value, int | float) and (name, value) != ("clip_range", None):
+            if not isinstance(value, numbers.Real) and (name, value) != ("clip_range", None):
                 raise ParameterError(f"{name} is {value!r}; expected a number, as predictions are of one that stays")
 
     def schedule(self, config: Configuration) -> "Schedule":
@@ -278,9 +279,9 @@ def _steps_between(train_freq: object) -> int:
     """
     is_pair = isinstance(train_freq, list | tuple) and len(train_freq) == 2 and train_freq[1] == "step"
     steps = train_freq[0] if is_pair else train_freq  # type: ignore[index]
-    if not isinstance(steps, int):
+    if not isinstance(steps, numbers.Integral):
         raise ParameterError(f"train_freq is {train_freq!r}; expected a number of steps, as predictions are of steps")
-    return steps
+    return int(steps)
 
 
 def _adam(hyperparameters: Mapping[str, Any], **defaults: float) -> "Adam":
